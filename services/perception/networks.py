@@ -1,0 +1,79 @@
+"""Networks that find the objects: extraction (mask, centre, scale) in the image, identity on a crop.
+
+Both follow the paper's tables in role: a mask network, a spatial transformer that says where and how large, and an
+identity network that says whether the object is there.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from shared.generative_model import conv_stack
+
+INPUT_PX = 120  # side of the image that extraction sees
+MASK_PX = 60
+CELLS = 30  # side of the grid of votes
+
+
+def _block(channels_in: int, channels_out: int, stride: int = 1, dilation: int = 1) -> nn.Sequential:
+    return nn.Sequential(nn.Conv2d(channels_in, channels_out, 3, stride, padding=dilation, dilation=dilation),
+                         nn.LeakyReLU(0.1))
+
+
+class Extraction(nn.Module):
+    """Image [B, 3, 120, 120] -> for K objects masks and votes for centre and scale.
+
+    Returns mask logits [B, K, 60, 60] and, on a grid of 30x30 cells, vote logits [B, K, 30, 30] and votes
+    [B, K, 3, 30, 30]: offsets (du, dv) from the cell's centre in image widths, and log(scale).
+    """
+
+    def __init__(self, count: int):
+        super().__init__()
+        self.count = count
+        self.stem = nn.Sequential(_block(3, 16, stride=2), _block(16, 24))
+        self.middle = nn.Sequential(_block(24, 48, stride=2), _block(48, 48))
+        self.deep = nn.Sequential(_block(48, 80, stride=2), _block(80, 80), _block(80, 80, dilation=2),
+                                  _block(80, 80, dilation=4), _block(80, 48))
+        self.merge = _block(96, 64)
+        self.votes = nn.Conv2d(64, 4 * count, 1)
+        self.mask = nn.Conv2d(64 + 24, count, 3, padding=1)
+
+    def forward(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        fine = self.stem(image)
+        middle = self.middle(fine)
+        deep = F.interpolate(self.deep(middle), size=(CELLS, CELLS), mode="bilinear", align_corners=False)
+        features = self.merge(torch.cat([middle, deep], dim=1))
+        votes = self.votes(features).unflatten(1, (self.count, 4)).float()
+        wide = F.interpolate(features, size=(MASK_PX, MASK_PX), mode="bilinear", align_corners=False)
+        masks = self.mask(torch.cat([fine, wide], dim=1)).float()
+        return masks, votes[:, :, 0], votes[:, :, 1:]
+
+
+def tally(vote_logits: Tensor, votes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Counts the votes: [..., 30, 30] logits, [..., 3, 30, 30] votes -> presence logit [...], centre (u, v) in image
+    widths [..., 2], log(scale) [...]. The weight of a cell is its probability of seeing the object."""
+    cells = (torch.arange(CELLS, device=votes.device, dtype=votes.dtype) + 0.5) / CELLS
+    u = votes[..., 0, :, :] + cells
+    v = votes[..., 1, :, :] + cells[:, None]
+    flat = vote_logits.flatten(-2)
+    weight = torch.softmax(F.logsigmoid(flat) * 2.0, dim=-1)
+    center = torch.stack([(weight * x.flatten(-2)).sum(-1) for x in (u, v)], dim=-1)
+    return flat.topk(3, dim=-1).values.mean(-1), center, (weight * votes[..., 2, :, :].flatten(-2)).sum(-1)
+
+
+class Identity(nn.Module):
+    """Crop and mask [B, 4, 64, 64] -> presence logit [B], correction [B, 3], its log standard deviation [B, 3].
+
+    The correction (du, dv in crop sides, log of the scale's ratio) says how far the object is off the crop's centre.
+    """
+
+    def __init__(self, width: int = 2):
+        super().__init__()
+        self.convolutions = conv_stack(4, width)
+        self.head = nn.Sequential(nn.Linear(256 * width, 64), nn.LeakyReLU(), nn.Linear(64, 7))
+
+    def forward(self, crop: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        presence, correction, log_std = self.head(self.convolutions(crop)).float().split([1, 3, 3], dim=-1)
+        return presence.squeeze(-1), correction, log_std.clamp(-5.0, 1.0)

@@ -1,0 +1,132 @@
+"""The table, the objects and the camera in MuJoCo: poses in, images out. No physics runs; nothing moves by itself."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from services.simulator.objects import Mesh
+from services.simulator.opengl import HOW_TO_MEND, choose_backend
+from shared.errors import SaccadeError
+from shared.geometry import IMAGE_SIZE_PX, INTRINSICS_PX
+
+choose_backend()
+try:
+    import mujoco
+except (ImportError, AttributeError, OSError) as error:  # PyOpenGL raises AttributeError where the library is absent
+    raise SaccadeError(f"{HOW_TO_MEND} ({error})") from error
+
+TABLE_SIDE_M = 1.0
+NEAR_M, FAR_M = 0.05, 3.0
+_OUT_OF_SIGHT = np.array([0.0, 0.0, -100.0])
+
+
+def _build(meshes: tuple[Mesh, ...]) -> mujoco.MjModel:
+    """Compiles the model: every body is a mocap body, so a new scene needs no compilation."""
+    spec = mujoco.MjSpec()
+    spec.stat.extent, spec.stat.center = 1.0, [0, 0, 0]
+    spec.visual.map.znear, spec.visual.map.zfar = NEAR_M, FAR_M
+    spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [1, 1, 1], [0, 0, 0]
+    spec.visual.headlight.specular = [0, 0, 0]
+    spec.visual.global_.offwidth = spec.visual.global_.offheight = IMAGE_SIZE_PX
+    half = TABLE_SIDE_M / 2
+    spec.worldbody.add_geom(name="table", type=mujoco.mjtGeom.mjGEOM_BOX, size=[half, half, 0.01], pos=[0, 0, -0.01],
+                            contype=0, conaffinity=0)
+    rig = spec.worldbody.add_body(name="camera", mocap=True)
+    rig.add_camera(name="camera", resolution=[IMAGE_SIZE_PX] * 2, sensor_size=[1, 1], focal_pixel=[IMAGE_SIZE_PX] * 2)
+    for mesh in meshes:
+        _add_object(spec, mesh)
+    model = spec.compile()
+    for mesh in meshes:  # the specification takes texels one Python number at a time; the compiled model an array
+        start = model.tex_adr[model.tex(mesh.name).id]
+        model.tex_data[start:start + mesh.texture.size] = np.flipud(mesh.texture).ravel()
+    return model
+
+
+def _add_object(spec: mujoco.MjSpec, mesh: Mesh) -> None:
+    height, width, _ = mesh.texture.shape
+    spec.add_texture(name=mesh.name, type=mujoco.mjtTexture.mjTEXTURE_2D, width=width, height=height, nchannel=3,
+                     builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT)
+    material = spec.add_material(name=mesh.name)
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = mesh.name
+    spec.add_mesh(name=mesh.name, uservert=mesh.vertices_m.ravel().tolist(), userface=mesh.faces.ravel().tolist(),
+                  usertexcoord=mesh.texcoords.ravel().tolist(), inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
+    body = spec.worldbody.add_body(name=mesh.name, mocap=True)
+    body.add_geom(name=mesh.name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name, material=mesh.name,
+                  contype=0, conaffinity=0)
+
+
+class World:
+    """A scene that can be rendered. Not shared between threads: the OpenGL context belongs to its creator."""
+
+    def __init__(self, meshes: tuple[Mesh, ...], *, size_px: int = IMAGE_SIZE_PX,
+                 intrinsics_px: ArrayLike = INTRINSICS_PX):
+        self.meshes = {mesh.name: mesh for mesh in meshes}
+        self.size_px = size_px
+        self.model = _build(meshes)
+        self.data = mujoco.MjData(self.model)
+        self._rig = self.model.body("camera").mocapid[0]
+        self._mocap = {mesh.name: self.model.body(mesh.name).mocapid[0] for mesh in meshes}
+        try:
+            self.renderer = mujoco.Renderer(self.model, height=size_px, width=size_px)
+        except Exception as error:  # each OpenGL platform raises its own class
+            raise SaccadeError(f"{HOW_TO_MEND} ({error})") from error
+        self.set_intrinsics(intrinsics_px)
+        self.place({})
+
+    def set_intrinsics(self, intrinsics_px: ArrayLike) -> None:
+        """(fx, fy, cx, cy) in pixels of the rendered image; cx, cy from its top left corner."""
+        fx, fy, cx, cy = np.asarray(intrinsics_px, dtype=np.float64) / self.size_px
+        # a sensor of 1 x 1 m, so that metres on it are fractions of the image; MuJoCo shifts the sensor, not the image
+        self.model.cam_sensorsize[0] = (1.0, 1.0)
+        self.model.cam_intrinsic[0] = (fx, fy, 0.5 - cx, 0.5 - cy)
+        self.intrinsics_px = np.asarray(intrinsics_px, dtype=np.float64)
+
+    def place(self, poses: dict[str, tuple[ArrayLike, float]], table_rgb: ArrayLike = (128, 128, 128)) -> None:
+        """Puts objects at (box centre [3] in metres, yaw in radians); those not named are out of sight."""
+        self.poses = dict(poses)
+        self.model.geom("table").rgba[:3] = np.asarray(table_rgb) / 255.0
+        for name, mocap in self._mocap.items():
+            center, yaw = poses.get(name, (_OUT_OF_SIGHT, 0.0))
+            self.data.mocap_pos[mocap] = center
+            self.data.mocap_quat[mocap] = (np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2))
+
+    def show_table(self, visible: bool) -> None:
+        """Draws the table or leaves it out (object views of the training set have a black background)."""
+        self.model.geom("table").rgba[3] = float(visible)
+
+    def _prepare(self, world_from_camera: ArrayLike) -> None:
+        camera = np.asarray(world_from_camera, dtype=np.float64)
+        self.data.mocap_pos[self._rig] = camera[:3, 3]
+        mujoco.mju_mat2Quat(self.data.mocap_quat[self._rig], camera[:3, :3].ravel())
+        mujoco.mj_kinematics(self.model, self.data)
+        mujoco.mj_camlight(self.model, self.data)
+        self.renderer.update_scene(self.data, camera="camera")
+
+    def render(self, world_from_camera: ArrayLike) -> NDArray[np.uint8]:
+        """RGB image [H, W, 3] from a camera pose [4, 4]."""
+        self._prepare(world_from_camera)
+        return self.renderer.render().copy()
+
+    def render_depth(self, world_from_camera: ArrayLike) -> NDArray[np.float32]:
+        """Depth along the optical axis [H, W] in metres; beyond the far plane it is FAR_M."""
+        self.renderer.enable_depth_rendering()
+        try:
+            self._prepare(world_from_camera)
+            return np.minimum(self.renderer.render(), FAR_M).astype(np.float32)
+        finally:
+            self.renderer.disable_depth_rendering()
+
+    def render_masks(self, world_from_camera: ArrayLike) -> dict[str, NDArray[np.bool_]]:
+        """For every placed object, the pixels [H, W] where it is seen."""
+        self.renderer.enable_segmentation_rendering()
+        try:
+            self._prepare(world_from_camera)
+            ids = self.renderer.render()[..., 0].copy()
+        finally:
+            self.renderer.disable_segmentation_rendering()
+        return {name: ids == self.model.geom(name).id for name in self.poses}
+
+    def close(self) -> None:
+        """Frees the OpenGL context."""
+        self.renderer.close()

@@ -1,0 +1,123 @@
+"""Camera geometry: pinhole projection, look-at poses, spherical viewpoints.
+
+Conventions, everywhere: metres and radians; right-handed world, z up, table top at z = 0; OpenGL camera (looks along
+its -z, +x right, +y up); pixels are (u, v) = (column, row) of the 480x480 image; `a_from_b` maps points of b to a.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+IMAGE_SIZE_PX = 480
+# RealSense D435i at 640x480, cropped to the central 480x480: cx moves by 80 (the published agent forgot to).
+INTRINSICS_PX = (615.132, 615.221, 326.285 - 80.0, 231.780)  # fx, fy, cx, cy
+REFERENCE_RANGE_M = 0.40  # scale 1: the range at which the object views of the paper's dataset are taken
+
+
+def unit(vectors: ArrayLike) -> Array:
+    """Vectors [..., 3] scaled to length 1; a zero vector stays zero."""
+    vectors = np.asarray(vectors, dtype=np.float64)
+    norm = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return vectors / np.where(norm == 0.0, 1.0, norm)
+
+
+def rotation_towards(forward: ArrayLike) -> Array:
+    """Rotations world_from_camera [..., 3, 3] without roll whose -z is `forward` [..., 3].
+
+    Straight up or down, where "no roll" says nothing, the image's top points to world +x.
+    """
+    back = -unit(forward)
+    right = np.cross(np.array([0.0, 0.0, 1.0]), back)
+    degenerate = np.linalg.norm(right, axis=-1, keepdims=True) < 1e-9
+    right = unit(np.where(degenerate, np.array([0.0, -1.0, 0.0]), right))
+    return np.stack([right, np.cross(back, right), back], axis=-1)
+
+
+def pose(rotation: ArrayLike, position: ArrayLike) -> Array:
+    """Rigid transforms [..., 4, 4] from rotations [..., 3, 3] and positions [..., 3]."""
+    rotation = np.asarray(rotation, dtype=np.float64)
+    result = np.zeros((*rotation.shape[:-2], 4, 4))
+    result[..., :3, :3] = rotation
+    result[..., :3, 3] = position
+    result[..., 3, 3] = 1.0
+    return result
+
+
+def look_at(position: ArrayLike, target: ArrayLike) -> Array:
+    """world_from_camera [..., 4, 4] at `position` [..., 3] looking at `target` [..., 3], without roll."""
+    position = np.asarray(position, dtype=np.float64)
+    return pose(rotation_towards(np.asarray(target) - position), position)
+
+
+def direction(azimuth: ArrayLike, elevation: ArrayLike) -> Array:
+    """Unit vectors [..., 3] from a centre towards (azimuth, elevation), radians."""
+    azimuth, elevation = np.asarray(azimuth), np.asarray(elevation)
+    return np.stack([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth),
+                     np.sin(elevation) + 0.0 * azimuth], axis=-1)
+
+
+def spherical(position: ArrayLike, center: ArrayLike) -> tuple[Array, Array, Array]:
+    """(azimuth, elevation, range) of `position` [..., 3] around `center`: radians, radians, metres."""
+    offset = np.asarray(position, dtype=np.float64) - np.asarray(center, dtype=np.float64)
+    horizontal = np.hypot(offset[..., 0], offset[..., 1])
+    return (np.arctan2(offset[..., 1], offset[..., 0]), np.arctan2(offset[..., 2], horizontal),
+            np.linalg.norm(offset, axis=-1))
+
+
+def wrap(angle: ArrayLike) -> Array:
+    """Angles brought into [-pi, pi)."""
+    return (np.asarray(angle, dtype=np.float64) + np.pi) % (2 * np.pi) - np.pi
+
+
+def rotation_angle(a: ArrayLike, b: ArrayLike) -> Array:
+    """Angle (radians) of the rotation between rotations a and b [..., 3, 3]."""
+    trace = np.einsum("...ij,...ij->...", np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64))
+    return np.arccos(np.clip((trace - 1.0) / 2.0, -1.0, 1.0))
+
+
+def pixel_rays(pixels: ArrayLike, intrinsics: ArrayLike) -> Array:
+    """Unit rays [..., 3] in the camera frame through pixels (u, v) [..., 2]."""
+    fx, fy, cx, cy = np.asarray(intrinsics, dtype=np.float64)
+    pixels = np.asarray(pixels, dtype=np.float64)
+    x, y = (pixels[..., 0] - cx) / fx, -(pixels[..., 1] - cy) / fy
+    return unit(np.stack([x, y, -np.ones_like(x)], axis=-1))
+
+
+def project(points: ArrayLike, world_from_camera: ArrayLike, intrinsics: ArrayLike) -> tuple[Array, Array]:
+    """Pixels (u, v) [..., 2] and depths along the optical axis [...] (metres) of world points [..., 3].
+
+    Points behind the camera have a depth <= 0 and pixels that mean nothing.
+    """
+    fx, fy, cx, cy = np.asarray(intrinsics, dtype=np.float64)
+    camera = np.asarray(world_from_camera, dtype=np.float64)
+    local = (np.asarray(points, dtype=np.float64) - camera[..., :3, 3]) @ camera[..., :3, :3]
+    depth = -local[..., 2]
+    safe = np.where(np.abs(depth) < 1e-9, 1e-9, depth)
+    return np.stack([cx + fx * local[..., 0] / safe, cy - fy * local[..., 1] / safe], axis=-1), depth
+
+
+def euler_xyz(rotation: ArrayLike) -> Array:
+    """Angles (x, y, z) [3] with rotation = Rz(z) Ry(y) Rx(x), for rotation [3, 3]."""
+    r = np.asarray(rotation, dtype=np.float64)
+    y = np.arcsin(np.clip(-r[2, 0], -1.0, 1.0))
+    if abs(r[2, 0]) > 1.0 - 1e-12:  # gimbal lock: put everything in z
+        return np.array([0.0, y, np.arctan2(-r[0, 1], r[1, 1])])
+    return np.array([np.arctan2(r[2, 1], r[2, 2]), y, np.arctan2(r[1, 0], r[0, 0])])
+
+
+def rotation_xyz(angles: ArrayLike) -> Array:
+    """Rz(z) Ry(y) Rx(x) [3, 3] of angles (x, y, z) [3], radians, about the fixed axes."""
+    (cx, cy, cz), (sx, sy, sz) = np.cos(np.asarray(angles)), np.sin(np.asarray(angles))
+    rx = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
+    ry = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
+    rz = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
+    return rz @ ry @ rx
+
+
+def fibonacci_hemisphere(count: int) -> tuple[Array, Array]:
+    """`count` (azimuth, elevation) pairs spread evenly over the upper hemisphere (paper, appendix B)."""
+    index = np.arange(count) + 0.5
+    return wrap(index * np.pi * (3.0 - np.sqrt(5.0))), np.arcsin(1.0 - index / count)

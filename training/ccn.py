@@ -1,0 +1,116 @@
+"""Phase 1: the CCN of one object with loss L1 under GECO constraints (paper, section 3.2, table 8), and its identity
+network on the same crops."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from services.perception.networks import Identity
+from shared.generative_model import CCN, kl_divergence, log_density
+from training.crops import CropBatch, CropComposer
+
+TOLERANCE = 40.0  # GECO: squared error summed over a crop that is good enough
+LAMBDA_RANGE = (80.0, 100.0)
+LAMBDA_FACTOR, LAMBDA_EVERY = 1.01, 500
+KL_TRANSITION, KL_PRIOR = 50.0, 1.0
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two views of the same object and the displacement [B, 2] (azimuth, elevation; radians) from first to second."""
+
+    first: CropBatch
+    second: CropBatch
+    displacement: Tensor
+
+
+def sample_pair(composer: CropComposer, train_index: Tensor, batch: int, generator: torch.Generator) -> Pair:
+    """Random pairs of the training directions, composed."""
+    def pick() -> Tensor:
+        chosen = torch.randint(len(train_index), (batch,), generator=generator, device=composer.device)
+        return train_index[chosen]
+
+    i, j = pick(), pick()
+    azimuth = (composer.azimuth[j] - composer.azimuth[i] + np.pi) % (2 * np.pi) - np.pi
+    displacement = torch.stack([azimuth, composer.elevation[j] - composer.elevation[i]], dim=1)
+    return Pair(composer.compose(i, generator), composer.compose(j, generator), displacement)
+
+
+def squared_error(image: Tensor, target: Tensor, weight: Tensor) -> Tensor:
+    """Squared error summed over each crop, weighted mean over the batch. The sum matters: with the mean the KL wins."""
+    per_crop = ((image.float() - target) ** 2).sum((1, 2, 3))
+    return (per_crop * weight).sum() / weight.sum().clamp(min=1.0)
+
+
+def loss_l1(ccn: CCN, pair: Pair, lambdas: list[float], generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
+    """Loss L1 (equation 4), with o_2 compared to a decoding of its own latent (the paper's o_1 there is a slip)."""
+    both = torch.cat([pair.first.masked, pair.second.masked]).contiguous(memory_format=torch.channels_last)
+    mean, std = ccn.encoder(both)
+    noise = torch.randn(mean.shape, generator=generator, device=mean.device)
+    sample = mean + std * noise
+    half = len(mean) // 2
+    moved_mean, moved_std = ccn.transition(sample[:half], pair.displacement)
+    noise = torch.randn(moved_mean.shape, generator=generator, device=mean.device)
+    # half of the batch stands for o_1 and half for o_2 in the terms before the transition: the pairs are symmetric
+    quarter = half // 2
+    drawn = ccn.decoder(torch.cat([sample[:quarter], sample[half + quarter:], moved_mean + moved_std * noise]))
+    seen_1, seen_2 = (pair.first.visible > 0.3).float(), (pair.second.visible > 0.3).float()
+    errors = [squared_error(drawn[:quarter], pair.first.target[:quarter], seen_1[:quarter]),
+              squared_error(drawn[quarter:half], pair.second.target[quarter:], seen_2[quarter:]),
+              squared_error(drawn[half:], pair.second.target, seen_1 * seen_2)]
+    kl_move = (kl_divergence(mean[half:], std[half:], moved_mean, moved_std) * seen_1 * seen_2).mean()
+    kl_prior = (kl_divergence(mean, std, 0.0, 1.0).mean() + kl_divergence(moved_mean, moved_std, 0.0, 1.0).mean())
+    loss = sum(weight * (error - TOLERANCE) for weight, error in zip(lambdas, errors, strict=True))
+    loss = loss + KL_TRANSITION * kl_move + KL_PRIOR * kl_prior
+    parts = dict(zip(("first", "second", "moved"), (float(e.detach()) for e in errors), strict=True))
+    return loss, {**parts, "kl": float(kl_move.detach())}
+
+
+def adapt(lambdas: list[float], errors: list[float]) -> list[float]:
+    """GECO: raises the weight of a constraint that is violated and lowers the others, within the paper's range."""
+    return [float(np.clip(w * LAMBDA_FACTOR if e > TOLERANCE else w / LAMBDA_FACTOR, *LAMBDA_RANGE))
+            for w, e in zip(lambdas, errors, strict=True)]
+
+
+def identity_loss(identity: Identity, batch: CropBatch) -> Tensor:
+    """Presence (binary cross entropy) and the correction's Gaussian negative log likelihood where the object is seen."""
+    logit, correction, log_std = identity(batch.raw.contiguous(memory_format=torch.channels_last))
+    label = (batch.present & (batch.visible > 0.15)).float()
+    clear = ((~batch.present) | (batch.visible > 0.3) | (batch.visible < 0.05)).float()
+    presence = (F.binary_cross_entropy_with_logits(logit, label, reduction="none") * clear).mean()
+    error = ((correction - batch.correction) / log_std.exp()) ** 2 / 2 + log_std
+    seen = label * (batch.visible > 0.3)
+    return presence + 0.3 * (error.sum(1) * seen).sum() / seen.sum().clamp(min=1.0)
+
+
+@torch.inference_mode()
+def goal_search_errors(ccn: CCN, composer: CropComposer, held_out: Tensor, generator: torch.Generator, *,
+                       pairs: int = 150, jitter: float = 1.0) -> np.ndarray:
+    """Great-circle errors [pairs] (radians) of the goal direction that the transitioned latent finds for held-out
+    pairs of composed crops, on a grid of 5 degrees."""
+    def pick() -> Tensor:
+        return held_out[torch.randint(len(held_out), (pairs,), generator=generator, device=composer.device)]
+
+    i, j = pick(), pick()
+    here, goal = composer.compose(i, generator, jitter=jitter), composer.compose(j, generator, jitter=jitter)
+    (mean, _), (goal_mean, goal_std) = ccn.encoder(here.masked), ccn.encoder(goal.masked)
+    azimuth = torch.arange(0, 2 * np.pi, np.pi / 36)
+    elevation = torch.linspace(0.02, np.pi / 2 - 0.02, 18)
+    grid_e, grid_a = torch.meshgrid(elevation, azimuth, indexing="ij")
+    result = np.empty(pairs)
+    for n in range(pairs):
+        move = torch.stack([grid_a.flatten() - composer.azimuth[i[n]].cpu(),
+                            grid_e.flatten() - composer.elevation[i[n]].cpu()], dim=1).to(composer.device)
+        moved_mean, moved_std = ccn.transition(mean[n].expand(len(move), -1), move)
+        score = log_density(goal_mean[n], moved_mean, (moved_std ** 2 + goal_std[n] ** 2).sqrt())
+        best = int(score.argmax())
+        e, a = grid_e.flatten()[best], grid_a.flatten()[best]
+        ge, ga = composer.elevation[j[n]].cpu(), composer.azimuth[j[n]].cpu()
+        cosine = e.sin() * ge.sin() + e.cos() * ge.cos() * (a - ga).cos()
+        result[n] = float(torch.arccos(cosine.clamp(-1, 1)))
+    return result

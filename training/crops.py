@@ -1,0 +1,181 @@
+"""Crops for the CCN and the identity network: one object's view as the detector would cut it out, and the clean one.
+
+Scale, shift and roll are as wrong as the detector's own; other objects stand behind or in front; background, light and
+the mask vary. The targets stay clean, so the networks learn to see through all that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from services.simulator.views import ObjectViews
+from shared.generative_model import CROP_PX
+
+REFERENCE_SHELL = 2  # index of the paper's 0.40 m among the shells
+
+
+@dataclass(frozen=True)
+class CropBatch:
+    """B composed crops of one object.
+
+    rgb [B, 3, 64, 64], mask [B, 1, 64, 64] as a detector would give it, present [B] bool, visible [B] share of the
+    object not hidden, correction [B, 3] (du, dv in crop sides, log scale ratio), target [B, 3, 64, 64] clean view.
+    """
+
+    rgb: Tensor
+    mask: Tensor
+    present: Tensor
+    visible: Tensor
+    correction: Tensor
+    target: Tensor
+
+    @property
+    def masked(self) -> Tensor:
+        """What the CCN sees [B, 4, 64, 64]: the masked crop and its mask (o * alpha, paper section 3.2)."""
+        return torch.cat([self.rgb * self.mask, self.mask], dim=1)
+
+    @property
+    def raw(self) -> Tensor:
+        """What the identity network sees [B, 4, 64, 64]."""
+        return torch.cat([self.rgb, self.mask], dim=1)
+
+
+class CropComposer:
+    """Composes crops of `views` with `others` as clutter. All randomness comes from the generator of each call."""
+
+    def __init__(self, views: ObjectViews, others: list[ObjectViews], device: torch.device):
+        self.views, self.device = views, device
+        self.tiles = [_half_tiles(v).to(device) for v in [views, *others]]
+        self.side_m = torch.tensor([v.crop_side_m for v in [views, *others]], device=device)
+        self.azimuth = torch.as_tensor(views.azimuth_rad, dtype=torch.float32, device=device)
+        self.elevation = torch.as_tensor(views.elevation_rad, dtype=torch.float32, device=device)
+
+    def clean(self, index: Tensor) -> Tensor:
+        """Clean views [B, 3, 64, 64] at the reference range."""
+        return self.tiles[0][REFERENCE_SHELL, index, :3].float() / 255.0
+
+    def compose(self, index: Tensor, generator: torch.Generator, *, present: float = 1.0,
+                jitter: float = 1.0) -> CropBatch:
+        """Crops of the directions `index` [B]; with probability 1 - `present` the object is not there."""
+        def uniform(*shape: int) -> Tensor:
+            return torch.rand(*shape, generator=generator, device=self.device)
+
+        count = len(index)
+        strength = jitter * uniform(count) ** 0.7
+        log_scale = (uniform(count) * 2 - 1) * 0.25 * strength
+        shift = (uniform(count, 2) * 2 - 1) * 0.15 * strength[:, None]
+        roll = (uniform(count) * 2 - 1) * 0.12 * jitter
+        there = uniform(count) < present
+        canvas = _background(count, uniform)
+        alpha = torch.zeros(count, 1, CROP_PX, CROP_PX, device=self.device)
+        tile = self._tiles_of(0, index, uniform)
+        full = warp(tile, 2 * shift, log_scale.exp(), roll) * there[:, None, None, None]
+        for layer in ("behind", "object", "front"):
+            if layer == "object":
+                canvas, alpha = full[:, :3] + canvas * (1 - full[:, 3:]), full[:, 3:]
+                continue
+            clutter = self._clutter(count, uniform, near=(layer == "behind") & ~there, rare=layer == "front")
+            canvas, alpha = clutter[:, :3] + canvas * (1 - clutter[:, 3:]), alpha * (1 - clutter[:, 3:])
+        inside = _image_border(count, uniform)
+        canvas, alpha = canvas * inside, alpha * inside
+        visible = alpha.sum((1, 2, 3)) / full[:, 3].sum((1, 2)).clamp(min=1.0)
+        gain = 1 + (uniform(count, 3, 1, 1) * 2 - 1) * 0.08
+        rgb = (_on_some(canvas, uniform(count) < 0.3, _blur) * gain).clamp(0, 1)
+        correction = torch.cat([shift, log_scale[:, None]], dim=1)
+        return CropBatch(rgb, _detector_mask(alpha, uniform), there, visible, correction, self.clean(index))
+
+    def _tiles_of(self, which: int, index: Tensor, uniform) -> Tensor:
+        shells = self.tiles[which].shape[0]
+        shell = (uniform(len(index)) * shells).long()
+        return self.tiles[which][shell, index].float() / 255.0
+
+    def _clutter(self, count: int, uniform, *, near: Tensor, rare: bool) -> Tensor:
+        """Another object's view [B, 4, 64, 64] somewhere in the crop, or nothing; near the centre where `near`."""
+        which = (uniform(count) * (len(self.tiles) - 1)).long() + 1
+        result = torch.zeros(count, 4, CROP_PX, CROP_PX, device=self.device)
+        offset = (uniform(count, 2) * 2 - 1) * torch.where(near, 0.25, 1.5)[:, None]
+        scale = ((uniform(count) * 2 - 1) * 0.4).exp()
+        shown = near | (uniform(count) < (0.35 if rare else 0.45))
+        for k in range(1, len(self.tiles)):
+            rows = torch.nonzero((which == k) & shown).squeeze(1)
+            if len(rows) == 0:
+                continue
+            index = (uniform(len(rows)) * self.tiles[k].shape[1]).long()
+            ratio = torch.where(near[rows], torch.ones_like(self.side_m[0]), self.side_m[k] / self.side_m[0])
+            tile = self._tiles_of(k, index, uniform)
+            result[rows] = warp(tile, offset[rows], scale[rows] * ratio, torch.zeros_like(ratio))
+        return result
+
+
+def _half_tiles(views: ObjectViews) -> Tensor:
+    tiles = torch.as_tensor(views.tiles).permute(0, 1, 4, 2, 3)
+    shells, count = tiles.shape[:2]
+    halves = [F.avg_pool2d(tiles[s].float(), 2).round().to(torch.uint8) for s in range(shells)]
+    return torch.stack(halves).view(shells, count, 4, CROP_PX, CROP_PX)
+
+
+def warp(tiles: Tensor, center: Tensor, scale: Tensor, roll: Tensor) -> Tensor:
+    """Tiles [B, C, h, w] drawn on a crop: centre [B, 2] in half crop sides, scale [B] in crop sides, roll [B]."""
+    cos, sin = roll.cos() / scale, roll.sin() / scale
+    rows = torch.stack([torch.stack([cos, sin], -1), torch.stack([-sin, cos], -1)], dim=1)
+    theta = torch.cat([rows, -rows @ center[:, :, None]], dim=2)
+    grid = F.affine_grid(theta, [len(tiles), tiles.shape[1], CROP_PX, CROP_PX], align_corners=False)
+    return F.grid_sample(tiles, grid, align_corners=False)
+
+
+def _background(count: int, uniform) -> Tensor:
+    """Two flat colours with a random straight border (paper, appendix B); sometimes the second is the black beyond."""
+    axis = torch.linspace(-1, 1, CROP_PX, device=uniform(1).device)
+    angle = uniform(count) * 6.2832
+    side = (axis[None, None, :] * angle.cos()[:, None, None] + axis[None, :, None] * angle.sin()[:, None, None]
+            > (uniform(count) * 3 - 1)[:, None, None])
+    first, second = uniform(count, 3, 1, 1), uniform(count, 3, 1, 1) * (uniform(count, 1, 1, 1) < 0.5)
+    return torch.where(side[:, None], second, first)
+
+
+def _image_border(count: int, uniform) -> Tensor:
+    """1 inside the image, 0 outside [B, 1, 64, 64]: some crops hang over its edge."""
+    axis = torch.linspace(-0.5, 0.5, CROP_PX, device=uniform(1).device)
+    cut = torch.where(uniform(count) < 0.2, 0.05 + 0.45 * uniform(count), torch.full_like(uniform(count), 2.0))
+    side = (uniform(count) * 4).long()
+    horizontal = (axis[None] * (1 - 2 * (side % 2))[:, None]) < cut[:, None]
+    across = horizontal[:, None, None, :].expand(-1, 1, CROP_PX, -1)
+    return torch.where((side < 2)[:, None, None, None], across, across.transpose(2, 3)).float()
+
+
+def _on_some(image: Tensor, chosen: Tensor, change: Callable[[Tensor], Tensor]) -> Tensor:
+    """`change` applied to the rows `chosen` [B] bool, in place."""
+    rows = torch.nonzero(chosen).squeeze(1)
+    if len(rows):
+        image[rows] = change(image[rows])
+    return image
+
+
+def _blur(image: Tensor) -> Tensor:
+    return F.avg_pool2d(image, 3, stride=1, padding=1, count_include_pad=False)
+
+
+def _coarsen(factor: int) -> Callable[[Tensor], Tensor]:
+    return lambda mask: F.interpolate(F.avg_pool2d(mask, factor), scale_factor=factor, mode="bilinear",
+                                      align_corners=False)
+
+
+def _detector_mask(alpha: Tensor, uniform) -> Tensor:
+    """The true mask as coarse and as wrong as a detector's: pooled, dilated or not, with holes and false spots."""
+    pick, wrong = uniform(len(alpha)), uniform(len(alpha))
+    mask = _on_some(alpha.clone(), pick < 0.3, _coarsen(4))
+    mask = _on_some(mask, (pick > 0.3) & (pick < 0.7), _coarsen(2))
+    mask = _on_some(mask, uniform(len(alpha)) < 0.4, lambda m: F.max_pool2d(m, 3, stride=1, padding=1))
+    spots = uniform(len(alpha), 1, 5, 5)
+
+    def flip(some: Tensor) -> Tensor:
+        size = some.shape[-2:]
+        holes = F.interpolate(spots[:len(some)], size=size, mode="bilinear", align_corners=False) > 0.8
+        return torch.where(holes, 1 - some, some)
+
+    return _on_some(mask, wrong < 0.25, flip)
