@@ -1,0 +1,135 @@
+"""Typed configuration: one object for a run, validated, saved beside its log. An unknown key is an error."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from shared.errors import SaccadeError
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+
+
+class Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class BusConfig(Section):
+    """Where services meet. Loopback unless told otherwise; no multicast."""
+
+    kind: Literal["zenoh", "local"] = "zenoh"
+    endpoint: str = "tcp/127.0.0.1:0"  # port 0: the launcher picks a free one
+    world: str = Field("table", pattern=r"^[A-Za-z0-9_-]{1,64}$")
+
+
+class SceneConfig(Section):
+    """Which episodes: those of a scenes file, or drawn from a seed."""
+
+    objects: Literal["pantry", "ycb"] = "pantry"
+    names: tuple[str, ...] | None = None  # a subset of the set
+    file: Path | None = None
+    scene: str | None = None  # an id in the file; all of them where absent
+    count: int = Field(1, ge=1)
+    n_objects: int | None = Field(None, ge=1, le=20)
+    yaw: Literal["random", "fixed"] = "random"
+    goal_image: Path | None = None
+    explore: bool = False
+
+
+class SimulatorConfig(Section):
+    """The paper's environment (section 4.1)."""
+
+    max_steps: int = Field(350, ge=1)
+    publish_depth: bool = False  # no agent of ours needs it
+
+
+class PerceptionConfig(Section):
+    """`weights`: a folder with a manifest; the object set's own where absent."""
+
+    weights: Path | None = None
+    present_above: float = Field(0.6, ge=0, le=1)
+    passes: int = Field(2, ge=1, le=4)  # crops are corrected and cut again
+
+
+class BeliefConfig(Section):
+    """Particle filter per object (section 3.2) and the posterior over goal views."""
+
+    particles: int = Field(10_000, ge=100, le=1_000_000)
+    jitter_m: float = Field(0.002, gt=0)
+    present_above: float = Field(0.6, ge=0, le=1)
+    missed_weight: float = Field(1e-5, gt=0, le=1)
+    published_particles: int = Field(512, ge=16)
+    keyframes: int = Field(24, ge=1)
+    view_temper: float = Field(0.35, gt=0, le=1)  # views of one object are not independent
+
+
+class PlannerConfig(Section):
+    """Expected free energy over candidate viewpoints (equation 5)."""
+
+    candidates: int = Field(5_000, ge=10, le=1_000_000)
+    replan_every: int = Field(10, ge=1)
+    step_m: float = Field(0.05, gt=0, le=0.5)
+    range_std_m: float = Field(0.025, gt=0)
+    information_weight: float = Field(1.0, ge=0)
+
+
+class Config(Section):
+    """A run."""
+
+    seed: int = Field(0, ge=0)
+    bus: BusConfig = BusConfig()
+    scene: SceneConfig = SceneConfig()
+    simulator: SimulatorConfig = SimulatorConfig()
+    perception: PerceptionConfig = PerceptionConfig()
+    belief: BeliefConfig = BeliefConfig()
+    planner: PlannerConfig = PlannerConfig()
+
+    @property
+    def weights(self) -> Path:
+        """The folder of the weights in use."""
+        return self.perception.weights or REPOSITORY / "weights" / self.scene.objects
+
+    def with_values(self, values: dict[str, Any]) -> Config:
+        """A copy with dotted keys replaced (`{"scene.yaw": "fixed"}`). Raises SaccadeError for an unknown key."""
+        tree = self.model_dump(mode="json")
+        for dotted, value in values.items():
+            node = tree
+            *parents, last = dotted.split(".")
+            for parent in parents:
+                node = node.get(parent) if isinstance(node, dict) else None
+            if not isinstance(node, dict) or last not in node:
+                raise SaccadeError(f"configuration key {dotted!r} is unknown: see shared/config.py")
+            node[last] = str(value) if isinstance(value, Path) else value
+        return validate(tree, "command line")
+
+    def save(self, path: Path) -> None:
+        """Writes the resolved configuration as JSON; `load` reads it back."""
+        path.write_text(self.model_dump_json(indent=2) + "\n")
+
+
+def validate(tree: dict[str, Any], where: str) -> Config:
+    """The configuration in a tree. Raises SaccadeError that names the key."""
+    try:
+        return Config.model_validate(tree)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
+        raise SaccadeError(f"configuration key {key!r} in {where}: {first['msg']}") from error
+
+
+def load(path: Path | None) -> Config:
+    """Reads TOML or JSON; the default where no path is given."""
+    if path is None:
+        return Config()
+    try:
+        text = path.read_text()
+        tree = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
+    except OSError as error:
+        raise SaccadeError(f"configuration {path} cannot be read: {error.strerror}") from error
+    except ValueError as error:
+        raise SaccadeError(f"configuration {path} is neither TOML nor JSON: {error}") from error
+    return validate(tree, str(path))

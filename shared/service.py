@@ -1,0 +1,43 @@
+"""What a service is: a declaration of topics and a pure core. Wiring, replay and the process graph derive from it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from shared.messages import Message
+from shared.topics import Topic
+
+
+@dataclass(frozen=True)
+class Service:
+    """A declaration. The core runs once per step of `trigger`, when all `inputs` of that step (and the latched ones of
+    the episode) are there. A service without a trigger is driven by its own `begin` (the simulator, a camera)."""
+
+    name: str
+    inputs: tuple[Topic, ...]
+    trigger: Topic
+    outputs: tuple[Topic, ...]
+
+
+@dataclass(frozen=True)
+class Output:
+    """A message on its way out; `part` names the object where the topic has parts."""
+
+    topic: Topic
+    message: Message
+    part: str | None = None
+
+
+Inputs = dict[str, Any]  # topic name -> message, or {part: message} for a topic with parts
+
+
+class Core(Protocol):
+    """Messages in, messages out: no bus, no clock, no files. Its state is a fold over its inputs since `begin`."""
+
+    def begin(self, run: str, episode: int) -> Iterable[Output]:
+        """A new episode: forget everything; sources publish their first messages."""
+
+    def step(self, inputs: Inputs) -> Iterable[Output]:
+        """All inputs of one step."""
