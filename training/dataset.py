@@ -1,0 +1,49 @@
+"""The views of the objects, rendered once per training run and kept in its folder."""
+
+from __future__ import annotations
+
+import os
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from services.simulator.objects import load_mesh
+from services.simulator.views import ObjectViews, default_shells_m, render_views
+from shared.errors import SaccadeError
+from training.settings import TrainingConfig
+
+
+def path_of(run_dir: Path, name: str) -> Path:
+    """Where the views of one object are kept."""
+    return run_dir / "views" / f"{name}.npz"
+
+
+def render_missing(run_dir: Path, config: TrainingConfig, progress: Callable[[str, int, int], None]) -> None:
+    """Renders what is not there yet; `progress` hears (object, views done, views in all)."""
+    for name in config.names:
+        path = path_of(run_dir, name)
+        if path.is_file():
+            continue
+        mesh = load_mesh(config.objects, name)
+        total = config.views * len(default_shells_m(mesh.size_m))
+        views = render_views(mesh, count=config.views, progress=lambda done, n=name, t=total: progress(n, done, t))
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = path.with_suffix(".tmp.npz")
+        np.savez_compressed(temporary, tiles=views.tiles, shells_m=np.array(views.shells_m),
+                            azimuth_rad=views.azimuth_rad, elevation_rad=views.elevation_rad,
+                            crop_side_m=views.crop_side_m, size_m=views.size_m)
+        os.replace(temporary, path)
+
+
+def load_views(run_dir: Path, name: str) -> ObjectViews:
+    """Reads the views of one object. Raises SaccadeError where they are missing or damaged."""
+    path = path_of(run_dir, name)
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return ObjectViews(name, file["tiles"], tuple(float(x) for x in file["shells_m"]), file["azimuth_rad"],
+                               file["elevation_rad"], float(file["crop_side_m"]), file["size_m"])
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        raise SaccadeError(f"views {path} are missing or damaged ({error}): remove the file, they are rendered again") \
+            from error

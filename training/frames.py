@@ -1,0 +1,212 @@
+"""Camera images for the extraction network, composed from views of single objects (paper, appendix B).
+
+The composition obeys geometry: a camera in the workspace, objects standing on the table, each drawn from the nearest
+rendered direction and range, warped to where it would be seen, the nearer over the farther. No scene is ever rendered.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from torch import Tensor
+
+from services.perception.networks import INPUT_PX, MASK_PX
+from services.simulator.views import TILE_PX, ObjectViews
+from shared.geometry import (
+    IMAGE_SIZE_PX,
+    INTRINSICS_PX,
+    REFERENCE_RANGE_M,
+    direction,
+    look_at,
+    pixel_rays,
+    project,
+    rotation_towards,
+    spherical,
+)
+
+LEVELS = 4  # of the tile pyramid: 128, 64, 32, 16 pixels
+
+
+@dataclass(frozen=True)
+class FrameBatch:
+    """B images of K known objects: image [B, 3, 120, 120], mask [B, K, 60, 60], centre (u, v) in image widths
+    [B, K, 2], log_scale [B, K], visible [B, K] share of the object that is seen (0 where it is not there)."""
+
+    image: Tensor
+    mask: Tensor
+    center: Tensor
+    log_scale: Tensor
+    visible: Tensor
+
+
+@dataclass(frozen=True)
+class _Instance:
+    """One object in one image."""
+
+    scene: int
+    object: int
+    shell: int
+    index: int
+    level: int
+    tile_from_camera: NDArray[np.float64]  # [3, 3]: camera ray -> (tile x, tile y, 1) up to scale; tile in [-1, 1]
+    range_m: float
+    pixel: NDArray[np.float64]
+    side_px: float  # of the tile in the input image
+
+
+class FrameComposer:
+    """Composes images of all objects in `views`. All randomness comes from the generators of each call."""
+
+    def __init__(self, views: list[ObjectViews], device: torch.device):
+        self.views, self.device = views, device
+        self.pyramid = [_pyramid(v, device) for v in views]
+        self.coverage = [torch.as_tensor(v.tiles[..., 3].mean((2, 3)) / 255.0) for v in views]  # [S, N]
+        self.directions = [direction(v.azimuth_rad, v.elevation_rad) for v in views]
+        axis = (np.arange(INPUT_PX) + 0.5) * IMAGE_SIZE_PX / INPUT_PX
+        u, v = np.meshgrid(axis, axis)
+        self.rays = pixel_rays(np.stack([u, v], -1), INTRINSICS_PX)  # [120, 120, 3]
+        self.rays_t = torch.as_tensor(self.rays.reshape(-1, 3), dtype=torch.float32, device=device)
+
+    def compose(self, count: int, rng: np.random.Generator) -> FrameBatch:
+        """`count` images."""
+        cameras, instances = [], []
+        for scene in range(count):
+            camera, placed = self._scene(rng)
+            cameras.append(camera)
+            instances += self._instances(scene, camera, placed)
+        image, visible_px, mask = self._draw(cameras, instances, rng)
+        return self._labels(count, instances, image, visible_px, mask)
+
+    def _scene(self, rng: np.random.Generator):
+        """A camera pose and objects [(which, centre [3], yaw)]: as the agent meets them, and as goals show them."""
+        goal_like = rng.random() < 0.2
+        number = 1 if goal_like else int(rng.integers(0 if rng.random() < 0.2 else 1, min(5, len(self.views)) + 1))
+        placed = []
+        for which in rng.permutation(len(self.views))[:number]:
+            placed.append((int(which), self._free_place(int(which), placed, rng), rng.uniform(0, 2 * np.pi)))
+        if placed and (goal_like or rng.random() < 0.55):
+            which, center, _ = placed[0]
+            half = np.linalg.norm(self.views[which].size_m) / 2
+            offset = direction(rng.uniform(0, 2 * np.pi), np.arcsin(rng.random()))
+            position = center + rng.uniform(half + 0.05, 0.5 if goal_like else 0.8) * offset
+            target = center + rng.normal(0, 0.0 if goal_like and rng.random() < 0.7 else 0.06, 3)
+        else:
+            position = np.array([*rng.uniform(-0.5, 0.5, 2), rng.uniform(0.1, 0.6)])
+            target = np.array([*rng.uniform(-0.3, 0.3, 2), rng.uniform(0.0, 0.15)])
+        rotation = rotation_towards(target - position)
+        position = np.clip(position, [-0.5, -0.5, 0.1], [0.5, 0.5, 0.6])
+        for which, center, _ in placed:
+            radius = np.linalg.norm(self.views[which].size_m) / 2 + 0.05
+            away = position - center
+            if np.linalg.norm(away) < radius:
+                position = center + away * radius / max(np.linalg.norm(away), 1e-6)
+        camera = look_at(position, target)
+        if goal_like:
+            camera[:3, :3] = rotation
+        return camera, placed
+
+    def _free_place(self, which: int, placed: list, rng: np.random.Generator) -> NDArray[np.float64]:
+        size = self.views[which].size_m
+        radius = np.hypot(size[0], size[1]) / 2
+        for _ in range(20):
+            xy = rng.uniform(-0.25, 0.25, 2)
+            if all(np.linalg.norm(xy - other[1][:2]) > radius + np.hypot(*self.views[other[0]].size_m[:2]) / 2
+                   for other in placed):
+                break
+        return np.array([*xy, size[2] / 2])
+
+    def _instances(self, scene: int, camera: NDArray, placed: list) -> list[_Instance]:
+        result = []
+        for which, center, yaw in placed:
+            views = self.views[which]
+            azimuth, elevation, distance = spherical(camera[:3, 3], center)
+            seen_from = direction(azimuth - yaw, elevation)
+            pixel, depth = project(center, camera, INTRINSICS_PX)
+            if depth <= 0.02:
+                continue
+            tile_px = views.crop_side_m / distance * INTRINSICS_PX[0] * INPUT_PX / IMAGE_SIZE_PX
+            zoom = 2.0 * distance / views.crop_side_m
+            virtual = rotation_towards(center - camera[:3, 3])
+            matrix = np.diag([zoom, -zoom, -1.0]) @ virtual.T @ camera[:3, :3]
+            result.append(_Instance(
+                scene, which, int(np.argmin(np.abs(np.log(np.array(views.shells_m) / distance)))),
+                int(np.argmax(self.directions[which] @ seen_from)),
+                int(np.clip(np.round(np.log2(TILE_PX / tile_px)), 0, LEVELS - 1)), matrix, float(distance),
+                pixel / IMAGE_SIZE_PX, tile_px))
+        return sorted(result, key=lambda instance: -instance.range_m)
+
+    def _draw(self, cameras: list, instances: list[_Instance], rng: np.random.Generator):
+        """Paints far to near. Returns images [B, 3, H, W], each instance's visible pixels and mask [60, 60]."""
+        image = self._backgrounds(cameras, rng)
+        layers = self._warp(instances)
+        alphas = [layer[3].clone() for layer in layers]
+        for n, (instance, layer) in enumerate(zip(instances, layers, strict=True)):
+            image[instance.scene] = layer[:3] + image[instance.scene] * (1 - layer[3:])
+            for m in range(n):
+                if instances[m].scene == instance.scene:
+                    alphas[m] *= 1 - layer[3]
+        gain = torch.as_tensor(1 + rng.uniform(-0.08, 0.08, (len(image), 3, 1, 1)), dtype=torch.float32)
+        noise = torch.as_tensor(rng.standard_normal(image.shape, dtype=np.float32)) * 0.01
+        image = (image * gain.to(self.device) + noise.to(self.device)).clamp_(0, 1)
+        if not alphas:
+            return image, [], []
+        masks = F.interpolate(torch.stack(alphas)[:, None], size=(MASK_PX, MASK_PX), mode="area")[:, 0]
+        return image, [float(a.sum()) for a in alphas], masks
+
+    def _warp(self, instances: list[_Instance]) -> list[Tensor]:
+        """Each instance's layer [4, 120, 120], rgb premultiplied by coverage."""
+        layers: list[Tensor | None] = [None] * len(instances)
+        for level in range(LEVELS):
+            chosen = [n for n, instance in enumerate(instances) if instance.level == level]
+            if not chosen:
+                continue
+            tiles = torch.stack([self.pyramid[instances[n].object][level][instances[n].shell, instances[n].index]
+                                 for n in chosen]).float() / 255.0
+            matrices = torch.as_tensor(np.stack([instances[n].tile_from_camera for n in chosen]), dtype=torch.float32)
+            local = self.rays_t @ matrices.to(self.device).transpose(1, 2)  # [n, 14400, 3]
+            ahead = local[..., 2:] > 1e-3
+            grid = torch.where(ahead, local[..., :2] / local[..., 2:].clamp(min=1e-3), torch.full_like(local[..., :2], 9))
+            drawn = F.grid_sample(tiles, grid.view(-1, INPUT_PX, INPUT_PX, 2), align_corners=False)
+            for n, layer in zip(chosen, drawn, strict=True):
+                layers[n] = layer
+        return layers
+
+    def _backgrounds(self, cameras: list, rng: np.random.Generator) -> Tensor:
+        """The table in one colour on black, or two colours with a random border, or patches."""
+        images = np.zeros((len(cameras), INPUT_PX, INPUT_PX, 3), dtype=np.float32)
+        for image, camera in zip(images, cameras, strict=True):
+            rays = self.rays @ camera[:3, :3].T
+            down = np.where(rays[..., 2] < -1e-6, rays[..., 2], -1e-6)
+            hit = camera[:3, 3] + rays * (-camera[2, 3] / down)[..., None]
+            table = (np.abs(hit[..., :2]) < 0.5).all(-1) & (rays[..., 2] < 0)
+            image[table] = rng.random(3)
+            if rng.random() < 0.25:
+                angle, where = rng.uniform(0, 2 * np.pi), rng.uniform(-0.4, 0.4)
+                side = self.rays[..., 0] * np.cos(angle) + self.rays[..., 1] * np.sin(angle) > where
+                image[side & (table | (rng.random() < 0.5))] = rng.random(3)
+        return torch.as_tensor(images, device=self.device).permute(0, 3, 1, 2).contiguous()
+
+    def _labels(self, count: int, instances, image: Tensor, visible_px: list[float], masks) -> FrameBatch:
+        k = len(self.views)
+        mask = torch.zeros(count, k, MASK_PX, MASK_PX, device=self.device)
+        center, log_scale, visible = torch.zeros(count, k, 2), torch.zeros(count, k), torch.zeros(count, k)
+        for n, instance in enumerate(instances):
+            where = (instance.scene, instance.object)
+            whole = float(self.coverage[instance.object][instance.shell, instance.index]) * instance.side_px ** 2
+            mask[where] = masks[n]
+            center[where] = torch.as_tensor(instance.pixel, dtype=torch.float32)
+            log_scale[where] = float(np.log(REFERENCE_RANGE_M / instance.range_m))
+            visible[where] = visible_px[n] / max(min(whole, 0.5 * INPUT_PX ** 2), 1.0)
+        return FrameBatch(image, mask, center.to(self.device), log_scale.to(self.device), visible.to(self.device))
+
+
+def _pyramid(views: ObjectViews, device: torch.device) -> list[Tensor]:
+    """Tiles [S, N, 4, T, T] uint8 at 128, 64, 32 and 16 pixels."""
+    levels = [torch.as_tensor(views.tiles).permute(0, 1, 4, 2, 3).contiguous()]
+    for _ in range(LEVELS - 1):
+        levels.append(torch.stack([F.avg_pool2d(shell.float(), 2).round().to(torch.uint8) for shell in levels[-1]]))
+    return [level.to(device) for level in levels]

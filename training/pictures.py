@@ -1,0 +1,47 @@
+"""Sample pictures of a training run: what went in, what the networks made of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from PIL import Image
+from torch import Tensor
+
+from services.perception.networks import Extraction, tally
+from shared.generative_model import CCN
+from training.ccn import Pair
+from training.frames import FrameBatch
+
+
+def _save(path: Path, rows: list[Tensor]) -> None:
+    """Rows of images [N, 3, H, W] in [0, 1], one below the other."""
+    strips = [torch.cat(list(row.float().cpu().clamp(0, 1)), dim=2) for row in rows]
+    picture = (torch.cat(strips, dim=1).permute(1, 2, 0).numpy() * 255).astype(np.uint8)
+    Image.fromarray(picture).resize((picture.shape[1] * 2, picture.shape[0] * 2), Image.Resampling.NEAREST).save(path)
+
+
+@torch.inference_mode()
+def draw_ccn(path: Path, ccn: CCN, pair: Pair) -> None:
+    """Rows: input | masked crop | reconstruction | prediction after the transition | what should be seen there."""
+    mean, _ = ccn.encoder(pair.first.masked)
+    moved, _ = ccn.transition(mean, pair.displacement)
+    _save(path, [pair.first.rgb, pair.first.masked[:, :3], ccn.decoder(mean), ccn.decoder(moved), pair.second.target])
+
+
+@torch.inference_mode()
+def draw_extraction(path: Path, network: Extraction, batch: FrameBatch) -> None:
+    """Rows: input | true masks | predicted masks, with a cross where each present object's centre is believed."""
+    masks, vote_logits, votes = network(batch.image)
+    presence, center, _ = tally(vote_logits, votes)
+    size = batch.image.shape[-2:]
+    true = F.interpolate(batch.mask.amax(1, keepdim=True), size=size).expand(-1, 3, -1, -1)
+    seen = F.interpolate(masks.sigmoid().amax(1, keepdim=True), size=size).expand(-1, 3, -1, -1)
+    marked = batch.image.clone()
+    for b, k in torch.nonzero(presence > 0).tolist():
+        u, v = (center[b, k] * size[0]).round().long().clamp(2, size[0] - 3).tolist()
+        marked[b, :, v, u - 2:u + 3] = 1.0
+        marked[b, :, v - 2:v + 3, u] = 1.0
+    _save(path, [marked, true, seen])

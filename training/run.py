@@ -1,0 +1,123 @@
+"""A training run: renders the views, trains all parts side by side, shows progress, exports the weights."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import torch
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from services.simulator.objects import load_mesh
+from services.simulator.views import crop_side_m
+from shared.config import REPOSITORY
+from shared.errors import SaccadeError
+from shared.weights import ObjectCard, write_weights
+from training.dataset import render_missing
+from training.part import pick_device, read_checkpoint
+from training.settings import TrainingConfig, load_settings
+
+
+def start(run_dir: Path, config: TrainingConfig) -> TrainingConfig:
+    """Makes the run's folder, or goes on with the one that is there. Raises SaccadeError where that is another run."""
+    pick_device(config.device)
+    run_dir.mkdir(parents=True, exist_ok=True)
+    path = run_dir / "training.json"
+    if path.is_file() and load_settings(run_dir) != config:
+        raise SaccadeError(f"{run_dir} holds a run with other settings: continue with the same, or name another folder")
+    path.write_text(config.model_dump_json(indent=2) + "\n")
+    return config
+
+
+def train(run_dir: Path, config: TrainingConfig, *, jobs: int, console: Console) -> None:
+    """Trains every part that is not finished, `jobs` at a time, each in a process of its own."""
+    start(run_dir, config)
+    columns = (TextColumn("{task.description:>24}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
+               TextColumn("{task.fields[note]}"))
+    with Progress(*columns, console=console) as progress:
+        bars: dict[str, int] = {}
+
+        def show(name: str, done: int, total: int, note: str = "") -> None:
+            if name not in bars:
+                bars[name] = progress.add_task(name, total=total, note="")
+            progress.update(bars[name], completed=done, note=note)
+
+        render_missing(run_dir, config, lambda name, done, total: show(f"views {name}", done, total))
+        _train_parts(run_dir, config, jobs, show)
+
+
+def _train_parts(run_dir: Path, config: TrainingConfig, jobs: int, show) -> None:
+    waiting = list(config.parts)
+    running: dict[str, subprocess.Popen] = {}
+    try:
+        while waiting or running:
+            while waiting and len(running) < jobs:
+                part = waiting.pop(0)
+                command = [sys.executable, "-m", "training.part", str(run_dir), part]
+                running[part] = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=REPOSITORY,
+                                                 env={"OMP_NUM_THREADS": "1", **os.environ})
+            time.sleep(0.5)
+            for part, process in list(running.items()):
+                code = process.poll()
+                _show_part(run_dir, part, config, show)
+                if code is None:
+                    continue
+                if code:
+                    lines = process.stderr.read().strip().splitlines() or [f"exit code {code}"]
+                    raise SaccadeError(f"training {part} stopped: {lines[-1].removeprefix('saccade: ')}")
+                del running[part]
+    finally:
+        for process in running.values():
+            process.terminate()
+            process.wait()
+
+
+def _show_part(run_dir: Path, part: str, config: TrainingConfig, show) -> None:
+    try:
+        state = json.loads((run_dir / part / "progress.json").read_text())
+    except (OSError, ValueError):
+        return
+    losses = {k: v for k, v in state.items() if k not in ("step", "steps", "seconds")}
+    show(part, state["step"], config.steps(part), "  ".join(f"{k} {v:g}" for k, v in losses.items()))
+
+
+def export(run_dir: Path, weights_dir: Path) -> None:
+    """Writes the weights of a finished run and their manifest. Raises SaccadeError where a part is not finished."""
+    config = load_settings(run_dir)
+    states, losses, seconds = {}, {}, 0.0
+    for part in config.parts:
+        path = run_dir / part / "checkpoint.safetensors"
+        if not path.is_file():
+            raise SaccadeError(f"{path} is missing: that part is not trained yet")
+        facts, tensors = read_checkpoint(path)
+        if facts["step"] != config.steps(part):
+            raise SaccadeError(f"{part} is at step {facts['step']} of {config.steps(part)}: finish the training first")
+        states[part] = {k.removeprefix("model."): v for k, v in tensors.items() if k.startswith("model.")}
+        losses[part] = json.loads((run_dir / part / "losses.jsonl").read_text().splitlines()[-1])
+        seconds += facts["seconds"]
+    cards = []
+    for name in config.names:
+        size = load_mesh(config.objects, name).size_m
+        cards.append(ObjectCard(name, size, crop_side_m(size)))
+    write_weights(weights_dir, states, tuple(cards), {
+        "data": f"{config.views} directions of each object of {config.objects!r}, from four ranges, composed",
+        "training": config.model_dump(mode="json"), "losses": losses, "commit": _commit(),
+        "where_trained": _where(pick_device(config.device)), "seconds": round(seconds), "torch": torch.__version__})
+
+
+def _commit() -> str:
+    done = subprocess.run(["git", "describe", "--always", "--dirty", "--abbrev=40"], cwd=REPOSITORY,
+                          capture_output=True, text=True, check=False)
+    return done.stdout.strip() or "unknown"
+
+
+def _where(device: torch.device) -> str:
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    return f"CPU, {platform.machine()}, {os.cpu_count()} cores"
