@@ -24,6 +24,7 @@ class BusConfig(Section):
     kind: Literal["zenoh", "local"] = "zenoh"
     endpoint: str = "tcp/127.0.0.1:0"  # port 0: the launcher picks a free one
     world: str = Field("table", pattern=r"^[A-Za-z0-9_-]{1,64}$")
+    wait_for: tuple[str, ...] = ()  # services that must be ready before the source begins; the launcher fills it in
 
 
 class SceneConfig(Section):
@@ -61,7 +62,7 @@ class BeliefConfig(Section):
     particles: int = Field(10_000, ge=100, le=1_000_000)
     jitter_m: float = Field(0.002, gt=0)
     present_above: float = Field(0.6, ge=0, le=1)
-    missed_weight: float = Field(1e-5, gt=0, le=1)
+    missed_weight: float = Field(0.3, gt=0, le=1)
     published_particles: int = Field(512, ge=16)
     keyframes: int = Field(24, ge=1)
     view_temper: float = Field(0.35, gt=0, le=1)  # views of one object are not independent

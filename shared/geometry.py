@@ -121,3 +121,12 @@ def fibonacci_hemisphere(count: int) -> tuple[Array, Array]:
     """`count` (azimuth, elevation) pairs spread evenly over the upper hemisphere (paper, appendix B)."""
     index = np.arange(count) + 0.5
     return wrap(index * np.pi * (3.0 - np.sqrt(5.0))), np.arcsin(1.0 - index / count)
+
+
+GRID_ELEVATIONS, GRID_AZIMUTHS = 18, 72  # cells of 5 degrees
+
+
+def viewing_grid() -> tuple[Array, Array]:
+    """Centres of the cells on the upper viewing hemisphere: elevation [E] and azimuth [A], radians."""
+    return ((np.arange(GRID_ELEVATIONS) + 0.5) * np.pi / 2 / GRID_ELEVATIONS,
+            (np.arange(GRID_AZIMUTHS) + 0.5) * 2 * np.pi / GRID_AZIMUTHS - np.pi)

@@ -96,7 +96,7 @@ class Belief(Message):
     Position: mean [3] and covariance [3, 3] of the particle cloud (metres, world) and a sample of its particles.
     Goal view: log posterior [E, A] over the direction (elevation, azimuth; world axes, grid of `viewing_grid`) from
     which the object looks as in the goal image; absent while there is no goal or the object has not been seen.
-    `goal_presence`: probability that this is the goal's object.
+    `presence`: probability that the object is in the scene; `views`: how many views the pose is fused from.
     """
 
     object: str
@@ -133,25 +133,37 @@ class Plan(Message):
 
 @dataclass(frozen=True, kw_only=True)
 class Action(Message):
-    """A relative move in world axes: metres, and rotation about the fixed axes x, y, z in radians; |each| <= 0.5."""
+    """A relative move in world axes: metres, and rotation about the fixed axes x, y, z in radians; |each| <= 0.5.
+
+    `arrived`: the agent says that with this move it is at the goal's view.
+    """
 
     translation_m: array("f8", 3)
     rotation_rad: array("f8", 3)
+    arrived: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
 class Truth(Message):
-    """The simulator's ground truth, for evaluator and viewer only. `done`: no further frame will come."""
+    """The simulator's ground truth, for evaluator, viewer and oracle only. `done`: no further frame will come.
+
+    `keep_out_m`: radii of the spheres around the objects that the camera cannot enter. The target's centre is also that
+    of its place in the goal image where it does not stand on the table. `step` counts the actions taken.
+    """
 
     scene: str
     target: str
     names: list[str]
     centers_m: array("f8", "N", 3)
     yaws_rad: array("f8", "N")
+    keep_out_m: array("f8", "N")
+    target_center_m: array("f8", 3)
     world_from_camera: array("f8", 4, 4)
     goal_world_from_camera: array("f8", 4, 4)
     success: bool
     done: bool
+    declared: bool = False  # the agent has said that it had arrived
+    declared_true: bool = False  # and was within tolerance when it first said so
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -166,16 +166,21 @@ def _coarsen(factor: int) -> Callable[[Tensor], Tensor]:
 
 
 def _detector_mask(alpha: Tensor, uniform) -> Tensor:
-    """The true mask as coarse and as wrong as a detector's: pooled, dilated or not, with holes and false spots."""
-    pick, wrong = uniform(len(alpha)), uniform(len(alpha))
-    mask = _on_some(alpha.clone(), pick < 0.3, _coarsen(4))
-    mask = _on_some(mask, (pick > 0.3) & (pick < 0.7), _coarsen(2))
-    mask = _on_some(mask, uniform(len(alpha)) < 0.4, lambda m: F.max_pool2d(m, 3, stride=1, padding=1))
-    spots = uniform(len(alpha), 1, 5, 5)
+    """The true mask as a detector gives it: coarse, too large or too small, unsure inside, with holes and false spots.
+    Trained on better masks than it will see, the identity network reads the scale off their outline and is misled."""
+    count, size = len(alpha), alpha.shape[-2:]
+    pick, wrong = uniform(count), uniform(count)
+    mask = _on_some(alpha.clone(), pick < 0.3, _coarsen(8))
+    mask = _on_some(mask, (pick > 0.3) & (pick < 0.7), _coarsen(4))
+    mask = _on_some(mask, (pick > 0.7) & (pick < 0.9), _coarsen(2))
+    spots = uniform(count, 1, 5, 5)
 
     def flip(some: Tensor) -> Tensor:
-        size = some.shape[-2:]
         holes = F.interpolate(spots[:len(some)], size=size, mode="bilinear", align_corners=False) > 0.8
         return torch.where(holes, 1 - some, some)
 
-    return _on_some(mask, wrong < 0.25, flip)
+    mask = _on_some(mask, wrong < 0.15, flip)
+    sure = (1 + uniform(count, 1, 1, 1) * 3), (uniform(count, 1, 1, 1) * 2 - 1) * 2.5
+    doubt = F.interpolate(uniform(count, 1, 4, 4), size=size, mode="bilinear", align_corners=False)
+    doubt = (doubt - 0.5) * 6 * (uniform(count, 1, 1, 1) < 0.5)
+    return torch.sigmoid((mask * 2 - 1) * 2.5 * sure[0] + sure[1] + doubt)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import weakref
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -71,6 +73,7 @@ class World:
             self.renderer = mujoco.Renderer(self.model, height=size_px, width=size_px)
         except Exception as error:  # each OpenGL platform raises its own class
             raise SaccadeError(f"{HOW_TO_MEND} ({error})") from error
+        weakref.finalize(self, self.renderer.close)  # before the interpreter takes OpenGL apart
         self.set_intrinsics(intrinsics_px)
         self.place({})
 

@@ -1,0 +1,83 @@
+"""The belief over the scene: per object a position posterior and a posterior over the goal's viewpoint."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from services.belief.pose import GoalView
+from services.belief.position import PositionFilter, evidence_of
+from shared.config import Config
+from shared.errors import SaccadeError
+from shared.generative_model import Transition
+from shared.messages import Belief, Percept
+from shared.seeding import generator
+from shared.service import Inputs, Output, Service
+from shared.topics import BELIEF, GOAL_PERCEPT, PERCEPT
+from shared.weights import Weights
+
+SERVICE = Service("belief", inputs=(PERCEPT, GOAL_PERCEPT), trigger=PERCEPT, outputs=(BELIEF,))
+
+WORTH_COMPARING = 0.05  # goal presence below which an object's pose is not compared with the goal
+LOCALISED_M = 0.08  # deviation below which a view's displacement means something
+
+
+class BeliefFilter:
+    """Percepts in, beliefs out. State: particles and kept views, a fold over the episode's percepts."""
+
+    def __init__(self, config: Config, names: tuple[str, ...]):
+        self.config, self.names = config, names
+        weights = Weights(config.weights)
+        self.radius_m = {card.name: card.radius_m for card in weights.cards_of(names)}
+        self.transitions = {name: weights.fill(Transition(), name, "ccn.transition.") for name in names}
+
+    def begin(self, run: str, episode: int) -> Iterable[Output]:
+        """A new scene: nothing is known."""
+        self.episode = episode
+        self.positions = {name: PositionFilter(self.config.belief, self._rng(0, f"start {name}")) for name in self.names}
+        self.goal_views: dict[str, GoalView] = {}
+        self.goal_known = False
+        return ()
+
+    def _rng(self, step: int, what: str) -> np.random.Generator:
+        return generator(self.config.seed, self.config.bus.world, self.episode, step, f"belief {what}")
+
+    def step(self, inputs: Inputs) -> Iterable[Output]:
+        """One belief per object from all percepts of a step."""
+        percepts: dict[str, Percept] = inputs["percept"]
+        if not self.goal_known:
+            self.goal_known = True
+            self.goal_views = {
+                name: GoalView(self.config.belief, self.transitions[name], goal)
+                for name, goal in inputs["goal_percept"].items() if goal.presence > WORTH_COMPARING}
+        present = {name for name in self.names if percepts[name].presence > self.config.belief.present_above}
+        for name in self.names:
+            yield Output(BELIEF, self._update(name, percepts, present), name)
+
+    def _update(self, name: str, percepts: dict[str, Percept], present: set[str]) -> Belief:
+        percept, position = percepts[name], self.positions[name]
+        rng = self._rng(percept.step, name)
+        if name in present:
+            position.seen(percept, rng)
+        else:
+            others = [(evidence_of(percepts[other]), self.radius_m[other]) for other in sorted(present)]
+            position.missed(percept.world_from_camera, percept.intrinsics_px, others, rng)
+        mean, covariance = position.moments()
+        goal_view = self.goal_views.get(name)
+        if goal_view and name in present and np.trace(covariance) < LOCALISED_M ** 2:
+            goal_view.seen(percept, mean)
+        posterior = goal_view.log_posterior() if goal_view else None
+        return Belief(
+            run=percept.run, episode=percept.episode, step=percept.step, object=name, presence=position.presence,
+            world_from_camera=np.array(percept.world_from_camera), mean_m=mean, covariance_m2=covariance,
+            particles_m=position.sample(self.config.belief.published_particles, rng).astype(np.float32),
+            views=len(goal_view.keyframes) if goal_view else 0,
+            goal_log_posterior=None if posterior is None else posterior.astype(np.float32))
+
+
+def build(config: Config) -> BeliefFilter:
+    """The core for a run's configuration."""
+    if not config.scene.names:
+        raise SaccadeError("configuration key 'scene.names' is empty: name the objects to believe in")
+    return BeliefFilter(config, config.scene.names)

@@ -1,0 +1,91 @@
+"""From where an object would look like the goal: a posterior over its viewing hemisphere, fused over all views.
+
+Each view's latent pose is moved by every displacement to the cells of a grid; a cell is as likely as the goal's latent is
+under the moved one (paper, equations 2 and 5). Views at different places multiply; their disagreement is what makes the
+posterior of a nearly symmetric object multi-modal, and new views decide between the modes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from shared.config import BeliefConfig
+from shared.generative_model import Transition, log_density
+from shared.geometry import GRID_AZIMUTHS, GRID_ELEVATIONS, spherical, unit, viewing_grid, wrap
+from shared.messages import Percept
+
+Array = NDArray[np.float64]
+
+OUTLIER = 0.05  # share of views whose latent says nothing
+NEW_VIEW_RAD = 0.08  # a view this near to a kept one adds nothing
+MOVED_M = 0.01  # when the object is believed elsewhere by this much, the displacements are measured again
+
+
+@dataclass
+class Keyframe:
+    """A view that is kept: from where, what the latent was, and its log likelihood over the grid [E, A]."""
+
+    eye: Array
+    mean: torch.Tensor
+    quality: float
+    log_likelihood: Array
+
+
+class GoalView:
+    """The posterior of one object."""
+
+    def __init__(self, config: BeliefConfig, transition: Transition, goal: Percept):
+        self.config, self.transition = config, transition
+        self.goal_mean = torch.from_numpy(np.array(goal.latent_mean))
+        self.goal_std = torch.from_numpy(np.array(goal.latent_std))
+        elevation, azimuth = viewing_grid()
+        self.elevation, self.azimuth = (x.ravel() for x in np.meshgrid(elevation, azimuth, indexing="ij"))
+        # cells cover less of the sphere towards the pole: the prior is even over directions, not over cells
+        self.prior = np.log(np.cos(self.elevation)).reshape(GRID_ELEVATIONS, GRID_AZIMUTHS)
+        self.keyframes: list[Keyframe] = []
+        self.center: Array | None = None
+
+    def seen(self, percept: Percept, center: Array) -> None:
+        """Adds a view of the object, believed at `center` [3], unless one like it is kept."""
+        if self.center is None or np.linalg.norm(center - self.center) > MOVED_M:
+            self.center = np.array(center)
+            for keyframe in self.keyframes:
+                keyframe.log_likelihood = self._likelihood(keyframe.eye, keyframe.mean)
+        eye = percept.world_from_camera[:3, 3]
+        quality = percept.presence / (0.03 + percept.log_scale_std)
+        near = [k for k in self.keyframes if _angle(k.eye, eye, self.center) < NEW_VIEW_RAD]
+        if near and max(k.quality for k in near) * 1.2 > quality:
+            return
+        self.keyframes = [k for k in self.keyframes if all(k is not other for other in near)]
+        if len(self.keyframes) >= self.config.keyframes:
+            self.keyframes.remove(min(self.keyframes, key=lambda k: k.quality))
+        mean = torch.from_numpy(np.array(percept.latent_mean))
+        self.keyframes.append(Keyframe(np.array(eye), mean, quality, self._likelihood(eye, mean)))
+
+    @torch.inference_mode()
+    def _likelihood(self, eye: Array, mean: torch.Tensor) -> Array:
+        """log of the share of each cell in one view's say [E, A], with a floor for views that are wrong."""
+        azimuth, elevation, _ = spherical(eye, self.center)
+        displacement = np.stack([wrap(self.azimuth - azimuth), self.elevation - elevation], axis=-1)
+        moved_mean, moved_std = self.transition(mean.expand(len(displacement), -1),
+                                                torch.as_tensor(displacement, dtype=torch.float32))
+        score = log_density(self.goal_mean, moved_mean, (moved_std ** 2 + self.goal_std ** 2).sqrt()).double().numpy()
+        share = np.exp(score - score.max())
+        share = (1 - OUTLIER) * share / share.sum() + OUTLIER / len(share)
+        return np.log(share).reshape(GRID_ELEVATIONS, GRID_AZIMUTHS)
+
+    def log_posterior(self) -> Array | None:
+        """Normalised log probabilities [E, A]; None before the first view."""
+        if not self.keyframes:
+            return None
+        total = self.prior + self.config.view_temper * sum(k.log_likelihood for k in self.keyframes)
+        total -= total.max()
+        return total - np.log(np.exp(total).sum())
+
+
+def _angle(a: Array, b: Array, center: Array) -> float:
+    return float(np.arccos(np.clip(unit(a - center) @ unit(b - center), -1.0, 1.0)))

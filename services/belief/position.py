@@ -1,0 +1,145 @@
+"""Where an object is: a particle filter over its position (paper, section 3.2)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+from filterpy.monte_carlo import systematic_resample
+from numpy.typing import NDArray
+
+from shared.config import BeliefConfig
+from shared.geometry import IMAGE_SIZE_PX, REFERENCE_RANGE_M, pixel_rays, project
+from shared.messages import Percept
+
+Array = NDArray[np.float64]
+
+WORKSPACE_M = np.array([[-0.5, 0.5], [-0.5, 0.5], [0.0, 0.5]])
+MODEL_STD_M = 0.006  # what no network can know: the box's centre against what is seen of it
+CORRELATION = 2.0  # successive views err alike: their deviations count this much larger
+OUTLIER = 1e-3  # share of percepts that are of something else
+FRESH_SHARE = 0.02  # of the particles, redrawn from each percept, so that a lost object is found again
+MARGIN_PX = 30  # an object this near to the image's border need not be seen
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """A percept as a Gaussian in space: mean [3], covariance [3, 3], metres, world."""
+
+    mean: Array
+    covariance: Array
+    range_m: float
+    direction: Array
+
+
+def evidence_of(percept: Percept) -> Evidence:
+    """The Gaussian along the ray: sharp across it, as wide along it as the scale is uncertain."""
+    camera = percept.world_from_camera
+    ray = camera[:3, :3] @ pixel_rays(percept.pixel, percept.intrinsics_px)
+    range_m = REFERENCE_RANGE_M / percept.scale
+    across = CORRELATION * np.hypot(percept.pixel_std / percept.intrinsics_px[0] * range_m, MODEL_STD_M)
+    along = CORRELATION * np.hypot(percept.log_scale_std * range_m, MODEL_STD_M)
+    outer = np.outer(ray, ray)
+    covariance = across ** 2 * (np.eye(3) - outer) + along ** 2 * outer
+    return Evidence(camera[:3, 3] + range_m * ray, covariance, range_m, ray)
+
+
+@contextmanager
+def _global_state(rng: np.random.Generator) -> Iterator[None]:
+    """filterpy draws from NumPy's global state: lends it ours for the call."""
+    before = np.random.get_state()
+    np.random.seed(int(rng.integers(2 ** 32)))
+    try:
+        yield
+    finally:
+        np.random.set_state(before)
+
+
+class PositionFilter:
+    """Particles [N, 3] and weights [N] of one object."""
+
+    def __init__(self, config: BeliefConfig, rng: np.random.Generator):
+        self.config = config
+        self.particles = rng.uniform(WORKSPACE_M[:, 0], WORKSPACE_M[:, 1], (config.particles, 3))
+        self.weights = np.full(config.particles, 1.0 / config.particles)
+        self.log_odds = 0.0  # that the object is in the scene at all
+
+    @property
+    def presence(self) -> float:
+        """Probability that the object is in the scene."""
+        return float(1.0 / (1.0 + np.exp(-np.clip(self.log_odds, -20, 20))))
+
+    def seen(self, percept: Percept, rng: np.random.Generator) -> None:
+        """Positive evidence: particles gain by their density under the percept's Gaussian."""
+        evidence = evidence_of(percept)
+        factor = np.linalg.cholesky(evidence.covariance)
+        density = _density(self.particles, evidence, factor)
+        mass = float(self.weights @ density)
+        # a cloud with next to nothing where the object is seen says nothing: draw there, as the percept says
+        share = FRESH_SHARE if mass > 0.01 else 0.7
+        fresh = rng.permutation(len(self.particles))[:int(share * len(self.particles))]
+        self.particles[fresh] = np.clip(evidence.mean + rng.standard_normal((len(fresh), 3)) @ factor.T,
+                                        WORKSPACE_M[:, 0], WORKSPACE_M[:, 1])
+        if mass <= 0.01:
+            self.weights[fresh] = 1.0 / len(self.particles)
+        else:
+            self.weights[fresh] = FRESH_SHARE / len(fresh)
+        self._reweigh(_density(self.particles, evidence, factor) + OUTLIER, rng)
+        odds = percept.presence / max(1.0 - percept.presence, 1e-3)
+        self.log_odds = min(self.log_odds + np.log(max(odds, 1e-3)), 8.0)
+
+    def missed(self, camera: Array, intrinsics_px: Array, seen: list[tuple[Evidence, float]],
+               rng: np.random.Generator) -> None:
+        """Negative evidence: particles in view, not behind any object that is `seen` (with its radius, metres), lose."""
+        visible = in_view(self.particles, camera, intrinsics_px) & ~behind(self.particles, camera[:3, 3], seen)
+        share = float(self.weights[visible].sum())
+        self._reweigh(np.where(visible, self.config.missed_weight, 1.0), rng)
+        self.log_odds = max(self.log_odds + np.log(max(1.0 - share * (1.0 - self.config.missed_weight), 1e-3)), -8.0)
+
+    def _reweigh(self, factors: Array, rng: np.random.Generator) -> None:
+        weights = self.weights * factors
+        self.weights = weights / weights.sum()
+        if 1.0 / np.sum(self.weights ** 2) < len(weights) / 2:
+            with _global_state(rng):
+                chosen = systematic_resample(self.weights)
+            noise = rng.normal(0.0, self.config.jitter_m, self.particles.shape)
+            self.particles = np.clip(self.particles[chosen] + noise, WORKSPACE_M[:, 0], WORKSPACE_M[:, 1])
+            self.weights = np.full(len(weights), 1.0 / len(weights))
+
+    def moments(self) -> tuple[Array, Array]:
+        """Mean [3] and covariance [3, 3] of the cloud."""
+        mean = self.weights @ self.particles
+        centred = self.particles - mean
+        return mean, (centred * self.weights[:, None]).T @ centred
+
+    def sample(self, count: int, rng: np.random.Generator) -> Array:
+        """`count` particles [count, 3] drawn by weight, evenly spread over the cloud."""
+        places = (np.arange(count) + rng.random()) / count
+        return self.particles[np.minimum(np.searchsorted(np.cumsum(self.weights), places), len(self.weights) - 1)]
+
+
+def _density(points: Array, evidence: Evidence, factor: Array) -> Array:
+    """Gaussian density relative to its peak [N]."""
+    whitened = np.linalg.solve(factor, (points - evidence.mean).T)
+    return np.exp(-0.5 * (whitened ** 2).sum(0))
+
+
+def in_view(points: Array, camera: Array, intrinsics_px: Array) -> NDArray[np.bool_]:
+    """Which points [N, 3] lie well inside the image."""
+    pixels, depth = project(points, camera, intrinsics_px)
+    inside = (pixels > MARGIN_PX) & (pixels < IMAGE_SIZE_PX - MARGIN_PX)
+    return inside.all(-1) & (depth > 0.05)
+
+
+def behind(points: Array, eye: Array, seen: list[tuple[Evidence, float]]) -> NDArray[np.bool_]:
+    """Which points [N, 3] an object that is seen may hide from the eye [3]: farther, and within its outline."""
+    hidden = np.zeros(len(points), dtype=bool)
+    offset = points - eye
+    distance = np.linalg.norm(offset, axis=1)
+    for evidence, radius_m in seen:
+        cosine = offset @ evidence.direction / np.maximum(distance, 1e-9)
+        widest = np.cos(np.arctan2(radius_m, evidence.range_m))
+        hidden |= (cosine > widest) & (distance > evidence.range_m)
+    return hidden

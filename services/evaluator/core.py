@@ -1,0 +1,39 @@
+"""The evaluator's core: the truth in, one result an episode out."""
+
+from __future__ import annotations
+
+from shared.config import Config
+from shared.messages import Result, Truth
+from shared.service import Inputs, Output, Service
+from shared.task import errors
+from shared.topics import RESULT, TRUTH
+
+SERVICE = Service("evaluator", inputs=(TRUTH,), trigger=TRUTH, outputs=(RESULT,))
+
+
+class Evaluator:
+    """Says how an episode ended, by the paper's measures (section 4.2), when its last truth arrives."""
+
+    def begin(self, run: str, episode: int) -> list[Output]:
+        """Nothing to forget: the last truth says it all."""
+        return []
+
+    def step(self, inputs: Inputs) -> list[Output]:
+        """The result, once the episode is done."""
+        truth: Truth = inputs["truth"]
+        return [Output(RESULT, result_of(truth))] if truth.done else []
+
+
+def result_of(truth: Truth) -> Result:
+    """The result of an episode of which `truth` is the last; errors are those of the last camera position."""
+    azimuth, elevation, distance = errors(truth.world_from_camera[:3, 3], truth.goal_world_from_camera[:3, 3],
+                                          truth.target_center_m)
+    return Result(run=truth.run, episode=truth.episode, step=truth.step, scene=truth.scene, target=truth.target,
+                  objects=len(truth.names), success=truth.success, steps=truth.step, azimuth_error_rad=azimuth,
+                  elevation_error_rad=elevation, range_error_m=distance, declared=truth.declared,
+                  declared_true=truth.declared_true)
+
+
+def build(config: Config) -> Evaluator:
+    """The evaluator; nothing about it is configured."""
+    return Evaluator()

@@ -1,0 +1,122 @@
+"""SceneCCN: from an image to one percept per object (paper, section 3.2). All objects are evaluated together."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import ArrayLike, NDArray
+
+from services.perception.cropping import Cropper, Window
+from services.perception.networks import INPUT_PX, Extraction, Identity, tally
+from shared.config import Config
+from shared.errors import SaccadeError
+from shared.generative_model import Encoder, Stacked
+from shared.messages import Frame, Goal, Percept
+from shared.service import Inputs, Output, Service
+from shared.topics import FRAME, GOAL, GOAL_PERCEPT, PERCEPT
+from shared.weights import Weights
+
+SERVICE = Service("perception", inputs=(FRAME, GOAL), trigger=FRAME, outputs=(PERCEPT, GOAL_PERCEPT))
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What the networks made of one image, for K objects: see `Percept` for the units."""
+
+    presence: NDArray[np.float64]
+    pixel: NDArray[np.float64]
+    pixel_std: NDArray[np.float64]
+    scale: NDArray[np.float64]
+    log_scale_std: NDArray[np.float64]
+    latent_mean: NDArray[np.float32]
+    latent_std: NDArray[np.float32]
+    crops: torch.Tensor  # [K, 4, 64, 64] masked crop and mask, for pictures
+
+
+class SceneCCN:
+    """The networks of K objects and how they work together."""
+
+    def __init__(self, weights: Weights, names: tuple[str, ...], passes: int = 2):
+        self.cards = weights.cards_of(names)
+        self.rows = [weights.names.index(name) for name in names]
+        self.extraction = weights.fill(Extraction(len(weights.names)), "extraction")
+        self.identity = Stacked([weights.fill(Identity(), name, "identity.") for name in names])
+        self.encoder = Stacked([weights.fill(Encoder(), name, "ccn.encoder.") for name in names])
+        self.sides_m = np.array([card.crop_side_m for card in self.cards])
+        self.passes = passes
+
+    @torch.inference_mode()
+    def see(self, rgb: NDArray[np.uint8], intrinsics_px: ArrayLike, up: ArrayLike) -> Seen:
+        """Infers all objects from an image [H, W, 3]; `up` [3]: which way is up, in the camera's frame."""
+        image = torch.from_numpy(np.array(rgb)).permute(2, 0, 1).float() / 255.0
+        small = F.interpolate(image[None], size=(INPUT_PX, INPUT_PX), mode="area")
+        masks, vote_logits, votes = (x[0, self.rows] for x in self.extraction(small))
+        logit, center, log_scale = tally(vote_logits, votes)
+        cropper = Cropper(image, masks.sigmoid(), intrinsics_px, up)
+        window = Window(center.double().numpy() * rgb.shape[1], log_scale.exp().double().numpy(), self.sides_m)
+        for _ in range(self.passes):
+            crops, crop_masks = cropper.cut(window)
+            raw = torch.cat([crops, crop_masks], dim=1)
+            identity_logit, correction, log_std = (x[:, 0] for x in self.identity(raw[:, None]))
+            before, window = window, cropper.corrected(window, correction.double().clamp(-0.5, 0.5).numpy())
+        masked = torch.cat([crops * crop_masks, crop_masks], dim=1)
+        mean, std = (x[:, 0] for x in self.encoder(masked[:, None]))
+        presence = (logit.sigmoid() * identity_logit.sigmoid()).double().numpy()
+        deviation = log_std.exp().double().numpy()
+        side_px = 2 * before.half_tangent * float(np.asarray(intrinsics_px)[0])
+        return Seen(presence, window.pixels, side_px * deviation[:, :2].mean(1), window.scales, deviation[:, 2],
+                    mean.numpy(), std.numpy(), masked)
+
+
+class Perception:
+    """Frames in, percepts out; the goal image once per episode by the same networks."""
+
+    def __init__(self, config: Config, names: tuple[str, ...]):
+        self.names = names
+        self.model = SceneCCN(Weights(config.weights), names, config.perception.passes)
+
+    def begin(self, run: str, episode: int) -> Iterable[Output]:
+        """Nothing is kept from frame to frame."""
+        self.goal_seen = False
+        return ()
+
+    def step(self, inputs: Inputs) -> Iterable[Output]:
+        """The goal's percepts at the first step of an episode, then the frame's."""
+        frame: Frame = inputs["frame"]
+        if not self.goal_seen:
+            self.goal_seen = True
+            yield from self._goal(inputs["goal"])
+        up = frame.world_from_camera[2, :3]
+        seen = self.model.see(frame.rgb, frame.intrinsics_px, up)
+        for k, name in enumerate(self.names):
+            yield Output(PERCEPT, percept(frame, name, seen, k, frame.world_from_camera), name)
+
+    def _goal(self, goal: Goal) -> Iterable[Output]:
+        if goal.rgb is None:
+            blank = np.zeros((480, 480, 3), dtype=np.uint8)
+            seen = self.model.see(blank, goal.intrinsics_px, (0.0, 1.0, 0.0))
+            seen.presence[:] = 0.0
+        else:
+            seen = self.model.see(goal.rgb, goal.intrinsics_px, (0.0, 1.0, 0.0))
+        for k, name in enumerate(self.names):
+            yield Output(GOAL_PERCEPT, percept(goal, name, seen, k, np.eye(4)), name)
+
+
+def percept(source: Frame | Goal, name: str, seen: Seen, k: int, world_from_camera: NDArray) -> Percept:
+    """The message of one object."""
+    return Percept(
+        run=source.run, episode=source.episode, step=source.step, object=name, presence=float(seen.presence[k]),
+        pixel=seen.pixel[k], pixel_std=float(seen.pixel_std[k]), scale=float(seen.scale[k]),
+        log_scale_std=float(seen.log_scale_std[k]), latent_mean=seen.latent_mean[k], latent_std=seen.latent_std[k],
+        intrinsics_px=np.asarray(source.intrinsics_px), world_from_camera=np.asarray(world_from_camera))
+
+
+def build(config: Config) -> Perception:
+    """The core for a run's configuration."""
+    if not config.scene.names:
+        raise SaccadeError("configuration key 'scene.names' is empty: name the objects to look for")
+    return Perception(config, config.scene.names)

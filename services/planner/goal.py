@@ -1,0 +1,50 @@
+"""What the goal image asks for: which object, at which scale, where in the image (paper, section 3.3)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from shared.geometry import REFERENCE_RANGE_M, Array, look_at, pixel_rays, pose, unit
+from shared.messages import Percept
+
+
+@dataclass(frozen=True)
+class Preference:
+    """The prior preference over observations: the target, its range (metres) with a deviation, its pixel [2]."""
+
+    target: str
+    range_m: float
+    range_std_m: float
+    pixel: NDArray[np.float64]
+    intrinsics_px: NDArray[np.float64]
+    confidence: float  # that the target is in the goal image
+
+
+def infer_preference(percepts: dict[str, Percept], range_std_m: float) -> Preference:
+    """The preference in the goal's percepts: the object that the goal image shows most surely."""
+    name = max(sorted(percepts), key=lambda n: percepts[n].presence)
+    percept = percepts[name]
+    range_m = REFERENCE_RANGE_M / percept.scale
+    deviation = float(np.hypot(range_std_m, percept.log_scale_std * range_m))
+    return Preference(name, range_m, deviation, percept.pixel, percept.intrinsics_px, percept.presence)
+
+
+def aim(position: ArrayLike, target: ArrayLike, pixel: ArrayLike, intrinsics_px: ArrayLike) -> Array:
+    """world_from_camera [4, 4] without roll at `position` [3] that sees `target` [3] at `pixel` (u, v)."""
+    position, target = np.asarray(position, dtype=np.float64), np.asarray(target, dtype=np.float64)
+    ray = pixel_rays(pixel, intrinsics_px)  # camera frame
+    towards = unit(target - position)
+    reach = np.hypot(ray[1], ray[2])
+    pitch = np.arcsin(np.clip(towards[2] / reach, -1.0, 1.0)) - np.arctan2(ray[1], -ray[2])
+    if abs(pitch) > np.pi / 2:  # no camera without roll sees it there: look straight at it
+        return look_at(position, target)
+    # with the heading along +x: right is -y, up is (-sin pitch, 0, cos pitch), back is -(cos pitch, 0, sin pitch)
+    rotation = np.array([[0.0, -np.sin(pitch), -np.cos(pitch)], [-1.0, 0.0, 0.0],
+                         [0.0, np.cos(pitch), -np.sin(pitch)]])
+    seen = rotation @ ray
+    heading = np.arctan2(towards[1], towards[0]) - np.arctan2(seen[1], seen[0])
+    turn = np.array([[np.cos(heading), -np.sin(heading), 0.0], [np.sin(heading), np.cos(heading), 0.0], [0, 0, 1.0]])
+    return pose(turn @ rotation, position)

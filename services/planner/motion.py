@@ -1,0 +1,103 @@
+"""Short steps towards a pose, around spheres that the camera may not enter. Used with believed and with true spheres."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.sparse.csgraph import dijkstra
+from scipy.spatial.transform import Rotation
+
+from shared.geometry import Array, direction, euler_xyz, fibonacci_hemisphere, unit
+from shared.task import ACTION_LIMIT, LOWER_M, UPPER_M, Spheres, clip
+
+STEP_M = 0.05
+_SLACK_M = 1e-6  # a camera that was pushed onto a sphere is outside it
+_DETOUR = 1.12  # corners of a detour lie on a sphere this much larger: neighbours among 48 see each other past it
+_AZIMUTH, _ELEVATION = fibonacci_hemisphere(48)
+_CORNERS = direction(_AZIMUTH, np.arcsin(2.0 * np.sin(_ELEVATION) - 1.0))  # even over the whole sphere
+
+
+def step_towards(world_from_camera: ArrayLike, goal_world_from_camera: ArrayLike, spheres: Spheres,
+                 step_m: float = STEP_M) -> tuple[Array, Array]:
+    """The next action, (translation [3] m, rotation [3] rad), on the way from a camera pose [4, 4] to a goal pose.
+
+    Moves at most `step_m` along the shortest way found around the spheres, so the way left shrinks with every step and
+    the camera never gets stuck; a goal inside a sphere is approached as near as `clip` allows. Turns along the great
+    arc, at most 0.5 rad about each axis.
+    """
+    camera = np.asarray(world_from_camera, dtype=np.float64)
+    goal = np.asarray(goal_world_from_camera, dtype=np.float64)
+    way = way_around(camera[:3, 3], goal[:3, 3], spheres)
+    return _along(way, step_m) - camera[:3, 3], turn_towards(camera[:3, :3], goal[:3, :3])
+
+
+def turn_towards(rotation: ArrayLike, goal_rotation: ArrayLike) -> Array:
+    """Angles [3] (radians, about the fixed axes, each at most 0.5) that turn one rotation [3, 3] towards another."""
+    turn = Rotation.from_matrix(np.asarray(goal_rotation) @ np.asarray(rotation).T).as_rotvec()
+    angle = float(np.linalg.norm(turn))
+    angles = euler_xyz(Rotation.from_rotvec(turn).as_matrix())
+    share = 1.0
+    while np.abs(angles).max() > ACTION_LIMIT:  # Euler angles are not linear in the share: approach it from above
+        share = min(0.95 * share, ACTION_LIMIT * 1.1 / angle)
+        angles = euler_xyz(Rotation.from_rotvec(share * turn).as_matrix())
+    return angles
+
+
+def way_around(start: ArrayLike, goal: ArrayLike, spheres: Spheres) -> Array:
+    """Corner points [K, 3] of a way from start to goal that stays outside the spheres; the straight one where it is free.
+
+    A start inside a believed sphere is taken as on its surface: the camera is there, so the belief is off.
+    """
+    start = np.asarray(start, dtype=np.float64)
+    goal = clip(goal, spheres)
+    distances = np.linalg.norm(spheres.centers_m - start, axis=1)
+    spheres = Spheres(spheres.centers_m, np.minimum(spheres.radii_m, distances) - _SLACK_M)
+    if _free(start[None], goal[None], spheres)[0, 0]:
+        return np.stack([start, goal])
+    points = np.concatenate([start[None], goal[None], _corners(start, goal, spheres)])
+    lengths = np.linalg.norm(points[:, None] - points[None], axis=-1)
+    lengths[~_free(points, points, spheres)] = 0.0  # no edge
+    _, before = dijkstra(lengths, indices=1, return_predecessors=True)
+    if before[0] < 0:  # walled in by wrong beliefs: leave upwards, over everything
+        return np.stack([start, np.array([start[0], start[1], UPPER_M[2]]), goal])
+    way = [0]
+    while way[-1] != 1:
+        way.append(before[way[-1]])
+    return points[way]
+
+
+def _corners(start: Array, goal: Array, spheres: Spheres) -> Array:
+    """Where a way may bend [K, 3]: around each sphere, above both ends, and outwards from the sphere an end touches."""
+    around = spheres.centers_m[:, None] + _DETOUR * spheres.radii_m[:, None, None] * _CORNERS
+    heights = np.linspace(LOWER_M[2], UPPER_M[2], 6)
+    above = [np.array([*end[:2], height]) for end in (start, goal) for height in heights]
+    outwards = [end + reach * away for end in (start, goal) for away in unit(end - spheres.centers_m)
+                for reach in (0.02, 0.05)]
+    points = np.concatenate([around.reshape(-1, 3), above, outwards])
+    inside_workspace = ((points >= LOWER_M) & (points <= UPPER_M)).all(axis=1)
+    outside = (np.linalg.norm(points[:, None] - spheres.centers_m, axis=-1) >= spheres.radii_m).all(axis=1)
+    return points[inside_workspace & outside]
+
+
+def _free(starts: Array, ends: Array, spheres: Spheres) -> np.ndarray:
+    """Whether the segments from starts [A, 3] to ends [B, 3] stay outside all spheres: [A, B]."""
+    along = ends[None] - starts[:, None]
+    square = np.maximum((along ** 2).sum(-1), 1e-18)
+    free = np.ones(square.shape, dtype=bool)
+    for center, radius in zip(spheres.centers_m, spheres.radii_m, strict=True):
+        to_center = center - starts
+        dot = np.einsum("ax,abx->ab", to_center, along)
+        share = np.clip(dot / square, 0.0, 1.0)
+        nearest = (to_center ** 2).sum(-1)[:, None] - 2 * share * dot + share ** 2 * square
+        free &= nearest >= max(radius, 0.0) ** 2
+    return free
+
+
+def _along(way: Array, distance_m: float) -> Array:
+    """The point [3] this far along a way [K, 3], or its end."""
+    for here, there in zip(way[:-1], way[1:], strict=True):
+        length = np.linalg.norm(there - here)
+        if length > distance_m:
+            return here + (there - here) * (distance_m / length)
+        distance_m -= length
+    return way[-1]

@@ -1,0 +1,161 @@
+"""The simulator's core: actions in, frames and the truth out, by the rules of shared/task.py."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, UnidentifiedImageError
+
+from services.simulator.objects import load_mesh, names_of
+from services.simulator.scenes import Placed, Scene, Sizes, generate_scene, load_scenes
+from services.simulator.world import World
+from shared.config import Config, SceneConfig
+from shared.errors import SaccadeError
+from shared.geometry import IMAGE_SIZE_PX
+from shared.messages import Frame, Goal, Truth
+from shared.seeding import generator
+from shared.service import Inputs, Output, Service
+from shared.task import MAX_STEPS, Episode, spheres_around
+from shared.topics import ACTION, FRAME, GOAL, TRUTH
+
+SERVICE = Service("simulator", inputs=(ACTION,), trigger=ACTION, outputs=(FRAME, GOAL, TRUTH))
+
+
+class Simulator:
+    """One world, episode after episode. Episode k is scene k; `episodes` says how many there are.
+
+    Every step gives the Truth and, until the episode is done, a Frame. With `goal_rgb` [H, W, 3] the user's image stands
+    in for the scene's goal: its view is unknown, so no step is a success and the episode ends when the agent declares.
+    """
+
+    def __init__(self, world: World, scenes: Sequence[Scene], *, max_steps: int = MAX_STEPS,
+                 publish_depth: bool = False, goal_rgb: NDArray[np.uint8] | None = None, explore: bool = False):
+        self.world, self.scenes, self.max_steps = world, tuple(scenes), max_steps
+        self.publish_depth, self.goal_rgb, self.explore = publish_depth, goal_rgb, explore
+
+    @property
+    def episodes(self) -> int:
+        """How many episodes there are to run."""
+        return len(self.scenes)
+
+    def begin(self, run: str, episode: int) -> list[Output]:
+        """Sets the scene; gives the goal, the first frame and the first truth."""
+        if not 0 <= episode < self.episodes:
+            raise SaccadeError(f"episode {episode} does not exist: there are {self.episodes}, counted from 0")
+        self.scene = self.scenes[episode]
+        self._run, self._episode = run, episode
+        present = self.scene.on_table
+        spheres = spheres_around([p.center_m for p in present], [self.world.meshes[p.name].size_m for p in present])
+        judged = self.goal_rgb is None and not self.explore
+        self.state = Episode(self.scene.goal_world_from_camera, spheres, max_steps=self.max_steps, judged=judged)
+        goal = Goal(**self._stamp(), rgb=self._goal_image(), intrinsics_px=self.world.intrinsics_px)
+        self._place(present)
+        return [Output(GOAL, goal), *self._outputs()]
+
+    def step(self, inputs: Inputs) -> list[Output]:
+        """Moves the camera; gives what it sees then. Nothing once the episode is over."""
+        if self._done:
+            return []
+        action = inputs["action"]
+        self.state.act(action.translation_m, action.rotation_rad, arrived=action.arrived)
+        return self._outputs()
+
+    @property
+    def _done(self) -> bool:
+        return self.state.done or (self.goal_rgb is not None and self.state.declared)
+
+    def _stamp(self) -> dict[str, str | int]:
+        return {"run": self._run, "episode": self._episode, "step": self.state.step}
+
+    def _place(self, objects: Sequence[Placed]) -> None:
+        self.world.place({p.name: (p.center_m, p.yaw_rad) for p in objects}, self.scene.table_rgb)
+
+    def _goal_image(self) -> NDArray[np.uint8] | None:
+        """The user's image, or the target alone on the table from the goal's pose; none while exploring."""
+        if self.explore:
+            return None
+        if self.goal_rgb is not None:
+            return self.goal_rgb
+        self._place([self.scene.target_placed])
+        return self.world.render(self.scene.goal_world_from_camera)
+
+    def _outputs(self) -> list[Output]:
+        truth = Output(TRUTH, self._truth())
+        return [truth] if self._done else [Output(FRAME, self._frame()), truth]
+
+    def _frame(self) -> Frame:
+        camera = self.state.camera
+        depth = self.world.render_depth(camera) if self.publish_depth else None
+        return Frame(**self._stamp(), rgb=self.world.render(camera), intrinsics_px=self.world.intrinsics_px,
+                     world_from_camera=camera, depth_m=depth)
+
+    def _truth(self) -> Truth:
+        scene, state, present = self.scene, self.state, self.scene.on_table
+        return Truth(**self._stamp(), scene=scene.id, target=scene.target, names=[p.name for p in present],
+                     centers_m=state.spheres.centers_m, yaws_rad=np.array([p.yaw_rad for p in present], dtype=np.float64),
+                     keep_out_m=state.spheres.radii_m, target_center_m=scene.target_placed.center_m,
+                     world_from_camera=state.camera, goal_world_from_camera=state.goal, success=state.success,
+                     done=self._done, declared=state.declared, declared_true=state.declared_true)
+
+
+def read_goal_image(path: Path) -> NDArray[np.uint8]:
+    """The user's goal image [480, 480, 3]. Raises SaccadeError unless it is a whole PNG or JPEG in RGB of that size."""
+    need = f"give a PNG or JPEG of {IMAGE_SIZE_PX}x{IMAGE_SIZE_PX} pixels in RGB"
+    try:
+        with Image.open(path, formats=("PNG", "JPEG")) as image:
+            if image.size != (IMAGE_SIZE_PX, IMAGE_SIZE_PX):
+                raise SaccadeError(f"goal image {path} is {image.size[0]}x{image.size[1]} pixels: {need}")
+            if image.mode != "RGB":
+                raise SaccadeError(f"goal image {path} has mode {image.mode}, not RGB: {need}")
+            return np.array(image)
+    except UnidentifiedImageError as error:
+        raise SaccadeError(f"goal image {path} is neither PNG nor JPEG: {need}") from error
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:  # a damaged PNG: SyntaxError
+        raise SaccadeError(f"goal image {path} cannot be read ({error}): {need}") from error
+
+
+def names_in_use(config: SceneConfig) -> tuple[str, ...]:
+    """The objects of the set, or the configured subset. Raises SaccadeError for a name that the set does not have."""
+    available = names_of(config.objects)
+    for name in config.names or ():
+        if name not in available:
+            raise SaccadeError(f"scene.names: {name!r} is not in {config.objects!r}: choose from {', '.join(available)}")
+    if config.names is not None and (not config.names or len(set(config.names)) < len(config.names)):
+        raise SaccadeError("scene.names: name at least one object, each once")
+    return config.names or available
+
+
+def scenes_of(config: Config, sizes: Sizes) -> list[Scene]:
+    """The scenes that a configuration asks for: from its file, or drawn from its seed, one per episode."""
+    scene = config.scene
+    if scene.file is not None:
+        scenes = load_scenes(scene.file, tuple(sizes))
+        if scene.scene is None:
+            return scenes
+        chosen = [s for s in scenes if s.id == scene.scene]
+        if not chosen:
+            raise SaccadeError(f"scene {scene.scene!r} is not in {scene.file}: choose an id such as {scenes[0].id!r}")
+        return chosen
+    if scene.scene is not None:
+        raise SaccadeError("scene.scene needs scene.file: give the file that holds the id")
+    drawn = []
+    for episode in range(scene.count):
+        rng = generator(config.seed, config.bus.world, episode, 0, "scene")
+        target = str(rng.choice(tuple(sizes)))
+        count = scene.n_objects or int(rng.integers(1, len(sizes) + 1))
+        drawn.append(generate_scene(rng, sizes, target, count, yaw=scene.yaw,
+                                    scene_id=f"{target}-{count}-{config.seed}.{episode}"))
+    return drawn
+
+
+def build(config: Config) -> Simulator:
+    """The simulator of a configuration. Raises SaccadeError for what is missing or damaged, before anything runs."""
+    scene = config.scene
+    goal_rgb = read_goal_image(scene.goal_image) if scene.goal_image is not None else None
+    meshes = tuple(load_mesh(scene.objects, name) for name in names_in_use(scene))
+    scenes = scenes_of(config, {mesh.name: mesh.size_m for mesh in meshes})
+    return Simulator(World(meshes), scenes, max_steps=config.simulator.max_steps,
+                     publish_depth=config.simulator.publish_depth, goal_rgb=goal_rgb, explore=scene.explore)

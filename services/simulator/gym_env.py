@@ -1,0 +1,107 @@
+"""Active search as a Gymnasium environment, for agents that are trained by reinforcement.
+
+    import gymnasium, services.simulator.gym_env
+    env = gymnasium.make("saccade/ActiveSearch-v0", n_objects=3)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from services.simulator.core import Simulator, names_in_use
+from services.simulator.objects import load_mesh
+from services.simulator.scenes import Scene, generate_scene, load_scenes
+from services.simulator.world import World
+from shared.config import SceneConfig
+from shared.errors import SaccadeError
+from shared.geometry import IMAGE_SIZE_PX
+from shared.messages import Action
+from shared.task import ACTION_LIMIT, MAX_STEPS, errors
+
+ID = "saccade/ActiveSearch-v0"
+Observation = dict[str, np.ndarray]
+
+
+class ActiveSearch(gymnasium.Env[Observation, NDArray[np.float64]]):
+    """Move a camera until it sees the goal image (paper, section 4.1).
+
+    Observation: `image` and `goal` [480, 480, 3] uint8, `pose` world_from_camera [4, 4] (metres).
+    Action [6] in [-0.5, 0.5]: translation (metres) and rotation about the fixed axes x, y, z (radians), world axes.
+    Reward: 1 on the step that reaches the goal (within 0.075 m and 0.5 rad), which terminates the episode; else 0.
+    Truncated after `max_steps`. `info` holds the scene's id and the errors in azimuth, elevation and range.
+
+    Every reset draws a scene from the environment's generator: with `scenes` one of a file, in which `scene=<id>` in
+    reset's options picks one; else a new one with `n_objects` (any number where absent).
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 - Gymnasium's interface
+
+    def __init__(self, *, objects: Literal["pantry", "ycb"] = "pantry", names: Sequence[str] | None = None,
+                 n_objects: int | None = None, yaw: Literal["random", "fixed"] = "random", scenes: Path | None = None,
+                 max_steps: int = MAX_STEPS, render_mode: str | None = None):
+        image = spaces.Box(0, 255, (IMAGE_SIZE_PX, IMAGE_SIZE_PX, 3), np.uint8)
+        self.observation_space = spaces.Dict(
+            {"image": image, "goal": image, "pose": spaces.Box(-1.0, 1.0, (4, 4), np.float64)})
+        self.action_space = spaces.Box(-ACTION_LIMIT, ACTION_LIMIT, (6,), np.float64)
+        self.render_mode, self.yaw, self.n_objects, self.max_steps = render_mode, yaw, n_objects, max_steps
+        in_use = names_in_use(SceneConfig(objects=objects, names=tuple(names) if names is not None else None))
+        self._world = World(tuple(load_mesh(objects, name) for name in in_use))
+        self._file = {scene.id: scene for scene in load_scenes(scenes, in_use)} if scenes is not None else {}
+        self._simulator: Simulator | None = None
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict]:
+        """A new scene. Raises SaccadeError for an id that the file does not have."""
+        super().reset(seed=seed)
+        self._simulator = Simulator(self._world, [self._draw((options or {}).get("scene"))], max_steps=self.max_steps)
+        outputs = {o.topic.name: o.message for o in self._simulator.begin("gym", 0)}
+        self._goal = outputs["goal"].rgb
+        return self._observe(outputs["frame"].rgb), self._info()
+
+    def _draw(self, scene_id: str | None) -> Scene:
+        if scene_id is not None and scene_id not in self._file:
+            raise SaccadeError(f"scene {scene_id!r} is not in the environment's file: give `scenes` a file that has it")
+        if self._file:
+            return self._file[scene_id or str(self.np_random.choice(list(self._file)))]
+        sizes = {name: mesh.size_m for name, mesh in self._world.meshes.items()}
+        target = str(self.np_random.choice(list(sizes)))
+        count = self.n_objects or int(self.np_random.integers(1, len(sizes) + 1))
+        return generate_scene(self.np_random, sizes, target, count, yaw=self.yaw)
+
+    def step(self, action: NDArray[np.float64]) -> tuple[Observation, float, bool, bool, dict]:
+        """One action [6]; see the class for the reward."""
+        if self._simulator is None:
+            raise gymnasium.error.ResetNeeded("call reset before step")
+        action = np.asarray(action, dtype=np.float64)
+        state = self._simulator.state
+        move = Action(run="gym", episode=0, step=state.step, translation_m=action[:3], rotation_rad=action[3:])
+        frames = [o.message for o in self._simulator.step({"action": move}) if o.topic.name == "frame"]
+        image = frames[0].rgb if frames else self._world.render(state.camera)  # the last step has no frame of its own
+        return self._observe(image), float(state.success), state.success, state.done and not state.success, self._info()
+
+    def _observe(self, image: NDArray[np.uint8]) -> Observation:
+        self._image = image.copy()
+        return {"image": image, "goal": self._goal.copy(), "pose": self._simulator.state.camera.copy()}
+
+    def _info(self) -> dict[str, Any]:
+        state, scene = self._simulator.state, self._simulator.scene
+        azimuth, elevation, distance = errors(state.camera[:3, 3], state.goal[:3, 3], scene.target_placed.center_m)
+        return {"scene": scene.id, "azimuth_error_rad": azimuth, "elevation_error_rad": elevation,
+                "range_error_m": distance}
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """What the camera sees [480, 480, 3], in render mode rgb_array."""
+        return self._image if self.render_mode == "rgb_array" else None
+
+    def close(self) -> None:
+        """Frees the OpenGL context."""
+        self._world.close()
+
+
+gymnasium.register(ID, entry_point="services.simulator.gym_env:ActiveSearch")

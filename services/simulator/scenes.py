@@ -1,0 +1,225 @@
+"""Scenes: what stands where and which view is the goal. Read from a file, or drawn by the paper's rules.
+
+A file is JSON: `{"scenes": [...]}`, one map per scene with the keys of SCENE_KEYS; metres, radians, table top at z = 0.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from shared.errors import SaccadeError
+from shared.geometry import direction, look_at
+from shared.task import GOAL_CLEARANCE_M, clip, spheres_around
+
+PAPER_SCENES = Path(__file__).parent / "scenes" / "paper_500.json"
+SCENE_KEYS = {"id", "target", "table_rgb", "objects", "goal_world_from_camera"}
+OBJECT_KEYS = {"name", "center_xyz_m", "yaw_rad"}
+HALF_SPREAD_M = 0.25  # objects stand in [-0.25, 0.25]^2
+GOAL_RANGE_MAX_M = 0.50
+_TRIES = 100  # per object, before the whole table is cleared and laid anew
+
+Sizes = Mapping[str, ArrayLike]  # name -> extents [3] of the object's box, metres
+
+
+@dataclass(frozen=True)
+class Placed:
+    """An object on the table: centre of its box [3] in metres, and its yaw in radians."""
+
+    name: str
+    center_m: NDArray[np.float64]
+    yaw_rad: float
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One episode's world. `table_rgb` 0 to 255; `goal_world_from_camera` [4, 4].
+
+    With `target_absent` the target's place serves the goal image alone: it does not stand on the table.
+    """
+
+    id: str
+    target: str
+    table_rgb: tuple[int, int, int]
+    objects: tuple[Placed, ...]
+    goal_world_from_camera: NDArray[np.float64]
+    target_absent: bool = False
+
+    @property
+    def target_placed(self) -> Placed:
+        """The target and its place."""
+        return next(placed for placed in self.objects if placed.name == self.target)
+
+    @property
+    def on_table(self) -> tuple[Placed, ...]:
+        """What the camera can meet."""
+        return tuple(p for p in self.objects if not (self.target_absent and p.name == self.target))
+
+
+def load_scenes(path: Path, names: Sequence[str] | None = None) -> list[Scene]:
+    """The scenes of a file, checked; with `names`, no other object may occur.
+
+    Raises SaccadeError, in one line with the file and the scene, for anything missing, damaged or contradictory.
+    """
+    try:
+        tree = json.loads(path.read_text())
+    except OSError as error:
+        raise SaccadeError(f"scenes {path} cannot be read ({error.strerror}): give the path of a scenes file") from error
+    except ValueError as error:
+        raise SaccadeError(f"scenes {path} is not JSON ({error}): write it with save_scenes") from error
+    entries = tree.get("scenes") if isinstance(tree, dict) else None
+    if not isinstance(entries, list) or not entries:
+        raise SaccadeError(f'scenes {path} holds no scenes: it must be {{"scenes": [...]}} with at least one')
+    scenes: dict[str, Scene] = {}
+    for index, entry in enumerate(entries):
+        name = entry.get("id", index) if isinstance(entry, dict) else index
+        try:
+            scene = _scene(entry, names)
+            if scene.id in scenes:
+                raise ValueError("its id occurs twice: make ids unique")
+        except (ValueError, TypeError, KeyError, OverflowError) as error:
+            raise SaccadeError(f"scenes {path}, scene {name!r}: {error}") from error
+        scenes[scene.id] = scene
+    return list(scenes.values())
+
+
+def _scene(entry: Any, names: Sequence[str] | None) -> Scene:
+    _check_keys(entry, SCENE_KEYS, {"target_absent"})
+    if not isinstance(entry["id"], str) or not entry["id"]:
+        raise ValueError("id must be a text")
+    if not isinstance(entry["objects"], list) or not entry["objects"]:
+        raise ValueError("objects must be a list of at least one object")
+    objects = tuple(_placed(placed, names) for placed in entry["objects"])
+    present = [placed.name for placed in objects]
+    if len(set(present)) < len(present):
+        raise ValueError("an object stands in it twice: name each at most once")
+    if entry["target"] not in present:
+        raise ValueError(f"target {entry['target']!r} is not among its objects: add it, with \"target_absent\": true "
+                         "if it must not stand on the table")
+    absent = entry.get("target_absent", False)
+    if not isinstance(absent, bool):
+        raise ValueError("target_absent must be true or false")
+    rgb = _numbers(entry, "table_rgb", (3,))
+    if not ((rgb >= 0) & (rgb <= 255) & (rgb == rgb.round())).all():
+        raise ValueError("table_rgb must be three whole numbers from 0 to 255")
+    goal = _numbers(entry, "goal_world_from_camera", (4, 4))
+    rotation = goal[:3, :3]
+    if (np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-4 or np.linalg.det(rotation) < 0
+            or np.abs(goal[3] - (0, 0, 0, 1)).max() > 1e-6):
+        raise ValueError("goal_world_from_camera is not a rigid transform")
+    red, green, blue = (int(value) for value in rgb)
+    return Scene(entry["id"], entry["target"], (red, green, blue), objects, goal, absent)
+
+
+def _placed(entry: Any, names: Sequence[str] | None) -> Placed:
+    _check_keys(entry, OBJECT_KEYS)
+    name = entry["name"]
+    if not isinstance(name, str):
+        raise ValueError("an object's name must be a text")
+    if names is not None and name not in names:
+        raise ValueError(f"object {name!r} is not in use: choose the set that has it (have {', '.join(names)})")
+    return Placed(name, _numbers(entry, "center_xyz_m", (3,)), float(_numbers(entry, "yaw_rad", ())))
+
+
+def _check_keys(entry: Any, required: set[str], optional: set[str] = frozenset()) -> None:
+    if not isinstance(entry, dict):
+        raise ValueError("not a map")
+    if missing := sorted(required - entry.keys()):
+        raise ValueError(f"{missing[0]} is missing")
+    if unknown := sorted(entry.keys() - required - optional):
+        raise ValueError(f"{unknown[0]} is unknown: remove it")
+
+
+def _numbers(entry: dict[str, Any], key: str, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    try:
+        raw = np.array(entry[key])
+    except ValueError as error:
+        raise ValueError(f"{key} must be numbers of shape {list(shape)}") from error
+    if raw.dtype.kind not in "iuf" or raw.shape != shape:
+        raise ValueError(f"{key} must be numbers of shape {list(shape)}")
+    if not np.isfinite(raw).all():
+        raise ValueError(f"{key} is not finite")
+    return raw.astype(np.float64)
+
+
+def save_scenes(path: Path, scenes: Sequence[Scene]) -> None:
+    """Writes scenes that load_scenes reads back."""
+    entries = []
+    for scene in scenes:
+        entry: dict[str, Any] = {
+            "id": scene.id, "target": scene.target, "table_rgb": list(scene.table_rgb),
+            "objects": [{"name": p.name, "center_xyz_m": p.center_m.tolist(), "yaw_rad": p.yaw_rad}
+                        for p in scene.objects],
+            "goal_world_from_camera": scene.goal_world_from_camera.tolist()}
+        entries.append(entry | ({"target_absent": True} if scene.target_absent else {}))
+    path.write_text('{"scenes": [\n' + ",\n".join(json.dumps(entry) for entry in entries) + "\n]}\n")
+
+
+def generate_scene(rng: np.random.Generator, sizes: Sizes, target: str, n_objects: int, *,
+                   yaw: Literal["random", "fixed"] = "random", scene_id: str = "drawn") -> Scene:
+    """Draws a scene as the benchmark's generator does (paper, section 4.1), with `n_objects` distinct objects.
+
+    `yaw="fixed"` is the paper's: objects are never turned. Raises SaccadeError for more objects than there are.
+    """
+    if target not in sizes:
+        raise SaccadeError(f"target {target!r} is not among the objects: choose from {', '.join(sizes)}")
+    if not 1 <= n_objects <= len(sizes):
+        raise SaccadeError(f"{n_objects} objects asked for, {len(sizes)} there: lower scene.n_objects or add names")
+    others = [name for name in sizes if name != target]
+    names = [target, *(others[i] for i in rng.permutation(len(others))[:n_objects - 1])]
+    names = [names[i] for i in rng.permutation(n_objects)]
+    extents = np.array([sizes[name] for name in names], dtype=np.float64)
+    centers = np.c_[_spread(rng, np.linalg.norm(extents[:, :2], axis=1) / 2), extents[:, 2] / 2]
+    yaws = rng.uniform(-np.pi, np.pi, n_objects) if yaw == "random" else np.zeros(n_objects)
+    index = names.index(target)
+    azimuth, elevation = rng.uniform(0, 2 * np.pi), rng.uniform(0, np.pi / 2)
+    nearest = min(np.linalg.norm(extents[index]) / 2 + GOAL_CLEARANCE_M, GOAL_RANGE_MAX_M)
+    position = centers[index] + rng.uniform(nearest, GOAL_RANGE_MAX_M) * direction(azimuth, elevation)
+    goal = look_at(position, centers[index])
+    goal[:3, 3] = clip(position, spheres_around(centers, extents))
+    red, green, blue = (int(value) for value in rng.integers(0, 256, 3))
+    objects = tuple(Placed(*placed) for placed in zip(names, centers, yaws.tolist(), strict=True))
+    return Scene(scene_id, target, (red, green, blue), objects, goal)
+
+
+def _spread(rng: np.random.Generator, radii_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Points xy [N, 2] whose circles do not overlap; starts over where the last object finds no room."""
+    for _ in range(_TRIES):
+        points: list[NDArray[np.float64]] = []
+        for radius in radii_m:
+            for _ in range(_TRIES):
+                point = rng.uniform(-HALF_SPREAD_M, HALF_SPREAD_M, 2)
+                if all(np.linalg.norm(point - p) >= radius + r for p, r in zip(points, radii_m, strict=False)):
+                    points.append(point)
+                    break
+        if len(points) == len(radii_m):
+            return np.array(points)
+    raise SaccadeError(f"{len(radii_m)} objects do not fit on the table side by side: lower scene.n_objects")
+
+
+def generate_split(sizes: Sizes, *, seed: int, targets: Sequence[str] | None = None,
+                   counts: Sequence[int] = (1, 2, 3, 4, 5), repeats: int = 20,
+                   yaw: Literal["random", "fixed"] = "random") -> list[Scene]:
+    """A split like the paper's: targets x counts x repeats. The same arguments draw the same scenes."""
+    scenes = []
+    for target in targets if targets is not None else tuple(sizes):
+        for count in counts:
+            for repeat in range(repeats):
+                number = seed + len(scenes)
+                rng = np.random.default_rng([seed, list(sizes).index(target), count, repeat])
+                scenes.append(generate_scene(rng, sizes, target, count, yaw=yaw, scene_id=f"{target}-{count}-{number}"))
+    return scenes
+
+
+def overlapping(scene: Scene, sizes: Sizes) -> list[tuple[str, str]]:
+    """Pairs of objects whose bounding circles overlap; empty for every generated scene."""
+    radius = {p.name: np.linalg.norm(np.asarray(sizes[p.name], dtype=np.float64)[:2]) / 2 for p in scene.objects}
+    return [(a.name, b.name) for a, b in combinations(scene.objects, 2)
+            if np.linalg.norm((a.center_m - b.center_m)[:2]) < radius[a.name] + radius[b.name] - 1e-9]

@@ -1,0 +1,163 @@
+"""The bus: bytes in, bytes out, by topic and part. Zenoh between processes, and a twin within one.
+
+Every endpoint is named: nothing is scouted, and nothing listens beyond the address given.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import socket
+import threading
+from collections.abc import Callable, Iterable
+from typing import Protocol
+
+from shared.errors import SaccadeError
+from shared.messages import MAX_BYTES
+from shared.topics import ROOT, Topic, parse_key
+
+Deliver = Callable[[Topic, str | None, bytes], None]  # runs on the bus's thread: must only put its arguments somewhere
+
+
+class Bus(Protocol):
+    """Messages of one key arrive in the order in which they were published; nothing is dropped."""
+
+    def publish(self, topic: Topic, part: str | None, payload: bytes) -> None:
+        """Sends wire bytes to whoever subscribes."""
+
+    def subscribe(self, topics: Iterable[Topic] | None, deliver: Deliver) -> None:
+        """Calls `deliver(topic, part, payload)` for every message of these topics, or of all."""
+
+    def close(self) -> None:
+        """Leaves the bus. May be called twice."""
+
+
+class LocalBus:
+    """The twin within one process: `publish` returns when every subscriber has its bytes."""
+
+    def __init__(self) -> None:
+        self._subscribers: list[tuple[frozenset[str] | None, Deliver]] = []
+
+    def publish(self, topic: Topic, part: str | None, payload: bytes) -> None:
+        """Delivers at once, on the caller's thread."""
+        for names, deliver in list(self._subscribers):
+            if names is None or topic.name in names:
+                deliver(topic, part, payload)
+
+    def subscribe(self, topics: Iterable[Topic] | None, deliver: Deliver) -> None:
+        """From now on; nothing published before is repeated."""
+        self._subscribers.append((None if topics is None else frozenset(t.name for t in topics), deliver))
+
+    def close(self) -> None:
+        """Forgets the subscribers."""
+        self._subscribers.clear()
+
+
+class ZenohBus:
+    """One Zenoh session in one world: the router's own (`listen`), or a client of the router at `endpoint`.
+
+    Raises SaccadeError if the endpoint is in use (listen), malformed, or does not answer within `timeout_s` seconds.
+    A router that goes away later is found again when it comes back.
+    """
+
+    def __init__(self, endpoint: str, *, world: str, listen: bool = False, timeout_s: float = 10.0) -> None:
+        import zenoh  # here, so that in-process runs do without it
+
+        self._world = world
+        self._zenoh = zenoh
+        self._lock = threading.Lock()
+        self._publishers: dict[str, zenoh.Publisher] = {}
+        self._subscribers: list[zenoh.Subscriber] = []
+        self._closed = False
+        self.endpoint = endpoint
+        if not listen and endpoint.endswith(":0"):
+            raise SaccadeError(f"bus at {endpoint}: port 0 is for the launcher only; name the port of a running bus")
+        self._session = _open(zenoh, endpoint, listen, timeout_s)
+
+    def publish(self, topic: Topic, part: str | None, payload: bytes) -> None:
+        """Blocks while the network is congested: in lockstep a lost message would stop the world."""
+        if topic.parts and not part:
+            raise ValueError(f"{topic.name} is published with a part")
+        key = topic.key(self._world, part)
+        with self._lock:
+            if self._closed:
+                return
+            publisher = self._publishers.get(key)
+            if publisher is None:
+                publisher = self._publishers[key] = self._session.declare_publisher(
+                    key, congestion_control=self._zenoh.CongestionControl.BLOCK, express=True)
+        try:
+            publisher.put(payload)
+        except self._zenoh.ZError:
+            if not self._closed:  # another thread may close the session while this one publishes
+                raise
+
+    def subscribe(self, topics: Iterable[Topic] | None, deliver: Deliver) -> None:
+        """One Zenoh subscriber per topic; for all topics one alone, so that their order of arrival is kept."""
+        keys = [f"{ROOT}/{self._world}/**"] if topics is None else [t.key(self._world) for t in topics]
+
+        def receive(sample) -> None:  # copies at once, so that shared memory is free again however slow the reader
+            try:
+                _, topic, part = parse_key(str(sample.key_expr))
+            except SaccadeError:
+                return
+            deliver(topic, part, sample.payload.to_bytes())
+
+        self._subscribers += [self._session.declare_subscriber(key, receive) for key in keys]
+
+    def close(self) -> None:
+        """Undeclares before it closes: a callback left behind can keep a process from ending."""
+        with self._lock:
+            if self._closed:
+                return
+            self._closed = True
+        for entity in (*self._subscribers, *self._publishers.values()):
+            entity.undeclare()
+        self._session.close()
+
+
+def free_endpoint(endpoint: str) -> str:
+    """The endpoint with port 0 replaced by a port that is free now."""
+    match = re.fullmatch(r"(\w+)/(\[[0-9a-fA-F:]+\]|[^\[\]:]+):0", endpoint)
+    if match is None:
+        return endpoint
+    host = match[2].strip("[]")
+    try:
+        with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
+            probe.bind((host, 0))
+            return f"{match[1]}/{match[2]}:{probe.getsockname()[1]}"
+    except OSError as error:
+        raise SaccadeError(f"bus at {endpoint}: cannot listen there: {error.strerror or error}") from error
+
+
+def _open(zenoh, endpoint: str, listen: bool, timeout_s: float):
+    config = zenoh.Config()
+    settings = {
+        "mode": "router" if listen else "client",
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "scouting/delay": 0,
+        "transport/link/rx/max_message_size": 2 * MAX_BYTES,
+    }
+    if not listen:
+        settings |= {"connect/timeout_ms": int(timeout_s * 1000), "connect/exit_on_failure": True,
+                     "connect/endpoints": [endpoint]}
+    else:
+        settings["listen/endpoints"] = [endpoint]
+    try:
+        for key, value in settings.items():
+            config.insert_json5(key, json.dumps(value))
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        raise SaccadeError(_explain(endpoint, listen, timeout_s, str(error))) from error
+
+
+def _explain(endpoint: str, listen: bool, timeout_s: float, error: str) -> str:
+    if "in use" in error:
+        return f"bus at {endpoint}: the port is in use; choose another, or port 0 for a free one"
+    if "Endpoints must be" in error or ("protocol" in error.lower() and "supported" in error):
+        return f"bus endpoint {endpoint!r} is not an address such as tcp/127.0.0.1:7447"
+    reason = error.split(" at /")[0]
+    if listen:
+        return f"bus at {endpoint}: cannot listen there: {reason}"
+    return f"bus at {endpoint} does not answer within {timeout_s:g} s; is it running? ({reason})"

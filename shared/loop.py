@@ -1,0 +1,166 @@
+"""The one main loop of every service, and the runner that drives the same cores in one process."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from shared.bus import Bus, ZenohBus
+from shared.config import Config
+from shared.errors import SaccadeError
+from shared.messages import Message, MessageError, decode, encode
+from shared.process import DRAIN_S, Health, Heartbeat, Inbox, run_process
+from shared.service import Core, Output, Service
+from shared.stepper import GapCounter, Stepper, settle
+from shared.topics import STATUS, Topic
+
+OnMessage = Callable[[Topic, str | None, Message, bytes | None], None]
+READY_STATES = ("ready", "busy")
+
+
+def main(service: Service, build: Callable[[Config], Core], *, source: bool = False,
+         parts: tuple[str, ...] | None = None, argv: Sequence[str] | None = None) -> None:
+    """A service's whole process: `--config RUN/config.json`, then messages in, messages out, until SIGTERM.
+
+    `parts` are the objects' names, those of the configuration unless given. A `source` begins its episodes itself,
+    the first once every service in `bus.wait_for` is ready. Bad input ends the process with one line and code 2.
+    """
+
+    def work(config: Config, folder: Path, inbox: Inbox) -> None:
+        names = parts if parts is not None else config.scene.names
+        if names is None:
+            raise SaccadeError("configuration key 'scene.names' is empty: the objects of the run are not resolved")
+        core = build(config)
+        bus = ZenohBus(config.bus.endpoint, world=config.bus.world)
+        try:
+            serve(service, core, bus, names, run=folder.name, source=source, wait_for=config.bus.wait_for, inbox=inbox)
+        finally:
+            bus.close()
+
+    run_process(service.name, work, argv=argv)
+
+
+def serve(service: Service, core: Core, bus: Bus, parts: tuple[str, ...], *, run: str, source: bool = False,
+          wait_for: tuple[str, ...] = (), inbox: Inbox | None = None) -> Health:
+    """Runs a core on a bus until `inbox` is stopped; returns what it counted."""
+    inbox = inbox or Inbox()
+    loop = _Loop(service, core, bus, parts, run, source, wait_for)
+    bus.subscribe(service.inputs + ((STATUS,) if loop.awaited else ()), inbox.put)
+    with Heartbeat(bus, loop.health, inbox.stop):
+        loop.health.say("ready", f"waits for {', '.join(sorted(loop.awaited))}" if loop.awaited else "")
+        loop.begin_if_due()
+        for topic, part, payload in inbox.items(0.0 if source else DRAIN_S):
+            loop.handle(topic, part, payload)
+    return loop.health
+
+
+class _Loop:
+    """What one service does with one message."""
+
+    def __init__(self, service: Service, core: Core, bus: Bus, parts: tuple[str, ...], run: str, source: bool,
+                 wait_for: tuple[str, ...]) -> None:
+        self.health = Health(service.name)
+        self.awaited = set(wait_for) if source else set()
+        self._stepper = Stepper(service, core, parts, source=source)
+        self._gaps = GapCounter()
+        self._bus, self._run, self._source = bus, run, source
+        self._episode = 0
+
+    def handle(self, topic: Topic, part: str | None, payload: bytes) -> None:
+        if topic == STATUS:
+            self._note_status(part, payload)
+            return
+        self.health.received += 1
+        try:
+            message = decode(topic.type, payload)
+            self.health.gaps += self._gaps.lost(topic, part, message)
+            self._stepper.offer(topic, part, message)
+        except MessageError as error:
+            self.health.refuse(topic, part, error)
+            return
+        while self._step(topic, part, self._stepper.advance):
+            self.begin_if_due()
+
+    def begin_if_due(self) -> None:
+        """Begins a source's next episode, if none is under way and everyone is there."""
+        while self._source and not self.awaited and self._stepper.episode_done:
+            if self._episode >= self._stepper.core.episodes:
+                self.health.say("finished")
+                return
+            episode, self._episode = self._episode, self._episode + 1
+            self._step(None, None, lambda e=episode: self._stepper.begin(self._run, e))
+
+    def _note_status(self, part: str | None, payload: bytes) -> None:
+        try:
+            status = decode(STATUS.type, payload)
+        except MessageError:
+            return  # whoever sent it is not ready
+        if part in self.awaited and status.state in READY_STATES:
+            self.awaited.discard(part)
+            if not self.awaited:
+                self.health.say(note="")
+                self.begin_if_due()
+
+    def _step(self, topic: Topic | None, part: str | None, make: Callable[[], list[Output] | None]) -> bool:
+        """Runs the core once and publishes what it made; whether there was anything to do."""
+        before, self.health.state = self.health.state, "busy"
+        start = time.perf_counter()
+        try:
+            outputs = make()
+            if outputs is None:
+                return False
+            self.health.milliseconds = (time.perf_counter() - start) * 1e3
+            self._publish(outputs)
+        except MessageError as error:
+            if topic is None:
+                name = self.health.service
+                raise SaccadeError(f"{name} cannot begin episode {self._episode - 1}: {error}") from error
+            self.health.refuse(topic, part, error)
+        finally:
+            self.health.state = before
+            self.health.at = self._stepper.at
+            self.health.skipped = self._stepper.skipped
+        return True
+
+    def _publish(self, outputs: list[Output]) -> None:
+        encoded = []
+        for output in outputs:  # all before the first is sent: a step is published as a whole or not at all
+            try:
+                encoded.append(encode(output.message))
+            except MessageError as error:
+                raise MessageError(f"gives an invalid {output.topic.name}: {error}") from error
+        for output, payload in zip(outputs, encoded, strict=True):
+            self._bus.publish(output.topic, output.part, payload)
+            self.health.published += 1
+
+
+def run_local(pairs: Sequence[tuple[Service, Core]], parts: tuple[str, ...], run_id: str, episodes: int | None = None,
+              on_message: OnMessage | None = None, *, encoded: bool = False) -> None:
+    """Runs the cores in this process until the source (the core with `episodes`) is done.
+
+    `on_message(topic, part, message, payload)` sees every message in the order of publication; payload is its wire
+    bytes if `encoded`, else None, and messages pass as they are. Raises SaccadeError if a step lacks an input for good.
+    """
+    sources = [Stepper(s, c, parts, source=True) for s, c in pairs if hasattr(c, "episodes")]
+    if len(sources) != 1:
+        raise SaccadeError(f"a run needs one source, not {len(sources)}: {', '.join(s.name for s, _ in pairs)}")
+    source = sources[0]
+    steppers = [source if c is source.core else Stepper(s, c, parts) for s, c in pairs]
+    for episode in range(source.core.episodes if episodes is None else min(episodes, source.core.episodes)):
+        waiting = deque(source.begin(run_id, episode))
+        while waiting:
+            output = waiting.popleft()
+            message = settle(output.message)
+            if on_message is not None:
+                on_message(output.topic, output.part, message, encode(message) if encoded else None)
+            for stepper in steppers:
+                if output.topic not in stepper.service.inputs:
+                    continue
+                stepper.offer(output.topic, output.part, message)
+                while (outputs := stepper.advance()) is not None:
+                    waiting.extend(outputs)
+        if not source.episode_done:
+            lacks = [f"{s.service.name} waits for {', '.join(s.waits_for())}" for s in steppers if s.waits_for()]
+            raise SaccadeError(f"episode {episode} came to a halt: {'; '.join(lacks) or 'nobody has anything to do'}")

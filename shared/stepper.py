@@ -1,0 +1,220 @@
+"""Which inputs belong together, when a core may step, and what number its messages get: pure, without bus or clock.
+
+The bus loop and the in-process runner both drive cores through `Stepper`, so that their outputs are equal to the byte.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from shared.errors import SaccadeError
+from shared.messages import Message, MessageError
+from shared.service import Core, Output, Service
+from shared.topics import TRUTH, Topic
+
+MAX_PENDING = 256  # incomplete steps kept, so that a flood of stray messages cannot fill the memory
+
+Episode = tuple[str, int]  # run and number
+Slot = dict[str, dict[str | None, Message]]  # topic name -> part -> message
+
+
+class Stamper:
+    """Numbers messages per key, in the order in which they are made."""
+
+    def __init__(self) -> None:
+        self._next: dict[tuple[str, str | None], int] = {}
+
+    def stamp(self, output: Output) -> Output:
+        """The output with its sequence number."""
+        key = (output.topic.name, output.part)
+        seq = self._next.get(key, 0)
+        self._next[key] = seq + 1
+        return dataclasses.replace(output, message=dataclasses.replace(output.message, seq=seq))
+
+
+class GapCounter:
+    """Tells from sequence numbers how many messages of a key were lost. A lower number is a publisher started anew."""
+
+    def __init__(self, *, from_start: bool = False) -> None:
+        self._from_start = from_start  # whether the counter has listened since before the first message
+        self._last: dict[tuple[str, str | None], tuple[str, int]] = {}
+
+    def lost(self, topic: Topic, part: str | None, message: Message) -> int:
+        """How many messages of this key are missing just before this one."""
+        key = (topic.name, part)
+        known = self._last.get(key)
+        self._last[key] = (message.run, message.seq)
+        if known is None or known[0] != message.run:
+            return message.seq if self._from_start and topic.in_step else 0
+        return max(0, message.seq - known[1] - 1)
+
+
+class Stepper:
+    """One core between its inputs and its outputs.
+
+    `offer` files a message, `advance` runs the core if a step is complete. Steps run in order; a latched message of
+    step s holds from step s of its episode. `parts` are the names of the run's objects. For a source, `begin` starts
+    an episode, and the inputs must answer the step it published last.
+    """
+
+    def __init__(self, service: Service, core: Core, parts: tuple[str, ...], *, source: bool = False) -> None:
+        if service.trigger not in service.inputs:
+            raise SaccadeError(f"service {service.name}: its trigger {service.trigger.name} is not among its inputs")
+        self.service, self.core, self.parts = service, core, parts
+        self.skipped = 0  # steps that never became complete
+        self.episode_done = source  # a source is between episodes
+        self.at: tuple[str, int, int] = ("", 0, 0)  # run, episode, step last begun or stepped
+        self._source = source
+        self._begun: Episode | None = None
+        self._past_runs: set[str] = set()
+        self._last_step = -1  # of the current episode
+        self._slots: dict[tuple[str, int, int], Slot] = {}
+        self._latched: dict[Episode, dict[str, dict[str | None, list[Message]]]] = {}
+        self._stamper = Stamper()
+        self._topics = {topic.name: topic for topic in service.inputs}
+
+    def offer(self, topic: Topic, part: str | None, message: Message) -> None:
+        """Files an input. One that comes too late is ignored. Raises MessageError for one that fits nowhere."""
+        if topic.name not in self._topics:
+            raise MessageError("topic: not an input")
+        if topic.parts and part not in self.parts:
+            raise MessageError(f"part: {part!r} is not an object of this run")
+        if topic.parts and getattr(message, "object", part) != part:
+            raise MessageError(f"object: {message.object!r} under the key of {part!r}")
+        if self._late(message, topic):
+            return
+        message = settle(message)
+        if topic.latched:
+            self._latch(topic, part, message)
+            return
+        if self._source and message.step != self._last_step:
+            raise MessageError(f"step: {message.step}, not {self._last_step}")
+        slot = self._slots.setdefault((message.run, message.episode, message.step), {})
+        if part in slot.setdefault(topic.name, {}):
+            raise MessageError(f"step: a second message for step {message.step}")
+        slot[topic.name][part] = message
+        self._limit()
+
+    def begin(self, run: str, episode: int) -> list[Output]:
+        """Starts an episode of a source and returns its first outputs."""
+        return self._emit(self._start((run, episode)))
+
+    def advance(self) -> list[Output] | None:
+        """Runs the core on the next complete step: its stamped outputs, or None if no step is complete."""
+        while True:
+            at = self._next_complete()
+            if at is None:
+                return None
+            run, episode, step = at
+            inputs = self._inputs(at)
+            first = [] if self._begun == (run, episode) else self._emit(self._start((run, episode)))
+            self._last_step, self.at = step, at
+            self._forget(at)
+            return first + self._emit(self.core.step(inputs))
+
+    def waits_for(self) -> list[str]:
+        """What the oldest incomplete step lacks, as texts such as 'percept/mug of step 3'; empty if nothing is open."""
+        if not self._slots:
+            return []
+        at = min(self._slots, key=lambda a: a[1:])
+        return [f"{name if part is None else f'{name}/{part}'} of step {at[2]} of episode {at[1]}"
+                for name, part in self._lacks(at)]
+
+    def _late(self, message: Message, topic: Topic) -> bool:
+        if message.run in self._past_runs:
+            return True
+        if self._begun is None or message.run != self._begun[0]:
+            return self._source
+        if message.episode != self._begun[1]:
+            return message.episode < self._begun[1]
+        return self.episode_done or (not topic.latched and message.step <= self._last_step and not self._source)
+
+    def _latch(self, topic: Topic, part: str | None, message: Message) -> None:
+        known = self._latched.setdefault((message.run, message.episode), {}).setdefault(topic.name, {})
+        held = [m for m in known.get(part, []) if m.step != message.step]
+        known[part] = sorted([*held, message], key=lambda m: m.step)[-MAX_PENDING:]
+        while len(self._latched) > MAX_PENDING:
+            self._latched.pop(next(iter(self._latched)))
+
+    def _limit(self) -> None:
+        while len(self._slots) > MAX_PENDING:
+            self._slots.pop(next(iter(self._slots)))
+            self.skipped += 1
+
+    def _lacks(self, at: tuple[str, int, int]) -> list[tuple[str, str | None]]:
+        slot, latched = self._slots[at], self._latched.get(at[:2], {})
+        lacking = []
+        for topic in self.service.inputs:
+            for part in self.parts if topic.parts else (None,):
+                if topic.latched:
+                    present = any(m.step <= at[2] for m in latched.get(topic.name, {}).get(part, []))
+                else:
+                    present = part in slot.get(topic.name, {})
+                if not present:
+                    lacking.append((topic.name, part))
+        return lacking
+
+    def _next_complete(self) -> tuple[str, int, int] | None:
+        complete = [at for at in self._slots if not self._lacks(at)]
+        if not complete:
+            return None
+        run = complete[0][0]  # runs follow one another in order of arrival, their steps by number
+        return min(at for at in complete if at[0] == run)
+
+    def _inputs(self, at: tuple[str, int, int]) -> dict[str, Any]:
+        slot, latched = self._slots[at], self._latched.get(at[:2], {})
+
+        def value(topic: Topic, part: str | None) -> Message:
+            if topic.latched:
+                return [m for m in latched[topic.name][part] if m.step <= at[2]][-1]
+            return slot[topic.name][part]
+
+        return {t.name: {p: value(t, p) for p in self.parts} if t.parts else value(t, None)
+                for t in self.service.inputs}
+
+    def _start(self, episode: Episode) -> Iterable[Output]:
+        if self._begun is not None and self._begun[0] != episode[0]:
+            self._past_runs.add(self._begun[0])
+        self._begun, self._last_step, self.at = episode, -1, (*episode, 0)
+        self.episode_done = False
+        self._latched = {e: v for e, v in self._latched.items() if e[0] != episode[0] or e[1] >= episode[1]}
+        return self.core.begin(*episode)
+
+    def _forget(self, at: tuple[str, int, int]) -> None:
+        """Drops the step and those before it: of one key all came in order, so what these lack is lost."""
+        del self._slots[at]
+        for old in [a for a in self._slots if a[0] in self._past_runs or (a[0] == at[0] and a[1:] < at[1:])]:
+            del self._slots[old]
+            self.skipped += 1
+
+    def _emit(self, outputs: Iterable[Output] | None) -> list[Output]:
+        stamped = []
+        for output in outputs or ():
+            if output.topic not in self.service.outputs:
+                raise SaccadeError(f"service {self.service.name} does not declare its output {output.topic.name}")
+            stamped.append(self._stamper.stamp(output))
+            if self._source:
+                self._last_step = max(self._last_step, output.message.step)
+                self.at = (output.message.run, output.message.episode, self._last_step)
+                self.episode_done |= output.topic == TRUTH and output.message.done
+        return stamped
+
+
+def settle(message: Message) -> Message:
+    """The message with arrays that are aligned, contiguous and frozen.
+
+    Bytes from the wire are seldom aligned, and NumPy may sum unaligned numbers in another order: without this the same
+    message would give other bytes in another process. Frozen, no core can change what another one holds.
+    """
+    changed = {}
+    for field in dataclasses.fields(message):
+        value = getattr(message, field.name)
+        if isinstance(value, np.ndarray) and not (
+                value.flags.aligned and value.flags.c_contiguous and not value.flags.writeable):
+            changed[field.name] = np.array(value, order="C")
+            changed[field.name].flags.writeable = False
+    return dataclasses.replace(message, **changed) if changed else message

@@ -1,0 +1,33 @@
+"""A valid message of any type, made from its annotations."""
+
+from __future__ import annotations
+
+import typing
+from typing import Annotated, Any
+
+import numpy as np
+
+from shared.messages import Message, field_types
+
+DIMENSIONS = {"H": 4, "W": 5, "L": 8, "N": 3, "E": 6, "A": 7}
+VALUES = {str: "mug", int: 3, float: 0.5, bool: True, list[str]: ["mug", "can"]}
+
+
+def sample(message_type: type[Message], **changes: Any) -> Message:
+    """Every field filled, also the optional ones."""
+    return message_type(**{name: _value(hint) for name, hint in field_types(message_type).items()} | changes)
+
+
+def array_fields(message_type: type[Message]) -> list[str]:
+    """Names of the fields that hold arrays."""
+    return [name for name, hint in field_types(message_type).items() if isinstance(_value(hint), np.ndarray)]
+
+
+def _value(hint: Any) -> Any:
+    if typing.get_origin(hint) is Annotated:
+        spec = typing.get_args(hint)[1]
+        shape = [DIMENSIONS.get(n, n) for n in spec.shape]
+        return (np.arange(np.prod(shape)) % 200).reshape(shape).astype(spec.dtype)
+    if hint in VALUES:
+        return VALUES[hint]
+    return _value(next(h for h in typing.get_args(hint) if h is not type(None)))

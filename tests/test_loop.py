@@ -1,0 +1,345 @@
+"""The one main loop: the same bytes over Zenoh, over the local bus and in one process; bad messages change nothing."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import queue
+import threading
+from collections import defaultdict
+from contextlib import closing
+
+import msgpack
+import numpy as np
+import pytest
+
+from shared.bus import LocalBus, ZenohBus, free_endpoint
+from shared.config import Config
+from shared.errors import SaccadeError
+from shared.loop import main, run_local, serve
+from shared.messages import MAX_BYTES, MessageError, Status, decode, encode
+from shared.process import Inbox
+from shared.service import Output, Service
+from shared.stepper import GapCounter, Stepper, settle
+from shared.topics import ACTION, BELIEF, FRAME, GOAL, GOAL_PERCEPT, PERCEPT, PLAN, RESULT, STATUS, TOPICS, TRUTH
+from tests.fakes.services import SERVICES, FakePlanner, pairs
+from tests.samples import array_fields, sample
+
+PARTS = ("mug", "can")
+CONFIG = Config().with_values({"scene.names": list(PARTS), "scene.count": 2, "simulator.max_steps": 6, "seed": 5})
+WAIT_S = 30  # for what must come; nothing is asserted about how long it takes
+
+
+def by_key(entries) -> dict:
+    """Payloads per key, in order; status is about the process and left out."""
+    keys = defaultdict(list)
+    for topic, part, payload in entries:
+        if topic != STATUS:
+            keys[topic.name, part].append(payload)
+    return dict(keys)
+
+
+def locally(*, encoded: bool) -> dict:
+    seen = []
+    run_local(pairs(CONFIG), PARTS, "r", None, lambda t, p, m, payload: seen.append((t, p, payload or encode(m))),
+              encoded=encoded)
+    return by_key(seen)
+
+
+class Running:
+    """The fake services, each in its thread on its own end of a bus, and a listener."""
+
+    def __init__(self, kind: str, names=tuple(SERVICES), wait_for=("perception", "belief", "planner", "evaluator")):
+        self.arrived: queue.SimpleQueue = queue.SimpleQueue()
+        self.listener = LocalBus()
+        if kind == "zenoh":
+            self.listener = ZenohBus(free_endpoint("tcp/127.0.0.1:0"), world="test", listen=True)
+        self.listener.subscribe(None, lambda *item: self.arrived.put(item))
+        self.kind, self.inboxes, self.threads, self.health = kind, {}, [], {}
+        for service, core in pairs(CONFIG):
+            if service.name in names:
+                self._start(service, core, wait_for)
+
+    def _start(self, service, core, wait_for) -> None:
+        inbox = self.inboxes[service.name] = Inbox()
+
+        def run() -> None:
+            bus = ZenohBus(self.listener.endpoint, world="test") if self.kind == "zenoh" else self.listener
+            self.health[service.name] = serve(service, core, bus, PARTS, run="r", source=service.name == "simulator",
+                                              wait_for=wait_for, inbox=inbox)
+            if self.kind == "zenoh":
+                bus.close()
+
+        self.threads.append(threading.Thread(target=run, daemon=True))
+        self.threads[-1].start()
+
+    def until(self, wanted) -> list:
+        """Everything that arrives up to the first entry for which `wanted(topic, part, payload)` holds."""
+        seen = []
+        while not seen or not wanted(*seen[-1]):
+            seen.append(self.arrived.get(timeout=WAIT_S))
+        return seen
+
+    def until_status(self, service: str, wanted) -> tuple[list, Status]:
+        """As `until`, for a status of that service."""
+        seen = self.until(lambda t, p, b: t == STATUS and p == service and wanted(decode(Status, b)))
+        return seen, decode(Status, seen[-1][2])
+
+    def close(self) -> None:
+        for inbox in self.inboxes.values():
+            inbox.stop()
+        for thread in self.threads:
+            thread.join(WAIT_S)
+        assert not any(thread.is_alive() for thread in self.threads)
+        self.listener.close()
+
+
+@pytest.mark.parametrize("kind", ["local", "zenoh"])
+def test_bus_and_one_process_give_the_same_bytes(kind):
+    with closing(Running(kind)) as running:
+        seen = running.until(lambda t, p, b: t == RESULT and decode(t.type, b).episode == CONFIG.scene.count - 1)
+    while not running.arrived.empty():
+        seen.append(running.arrived.get())
+    expected = locally(encoded=True)
+    assert by_key(seen) == expected
+    assert {name for name, _ in expected} == set(TOPICS) - {"status"}
+    for health in running.health.values():
+        assert (health.refused, health.skipped, health.gaps, health.state) == (0, 0, 0, "stopped")
+
+
+def test_passing_messages_unencoded_changes_no_byte():
+    assert locally(encoded=False) == locally(encoded=True)
+
+
+def test_sequence_numbers_count_the_messages_of_each_key():
+    for (name, _), payloads in locally(encoded=True).items():
+        assert [decode(TOPICS[name].type, p).seq for p in payloads] == list(range(len(payloads)))
+
+
+def nonsense(topic) -> dict[str, bytes]:
+    """Payloads that are no message of this topic, by what is wrong with them."""
+    good = sample(topic.type)
+    fields = msgpack.unpackb(encode(good), strict_map_key=True)
+    array = array_fields(topic.type)[0]
+    bad = {"not msgpack": b"\xc1\xc1", "empty": b"", "oversized": bytes(MAX_BYTES + 1), "cut": encode(good)[:-3],
+           "another type": encode(sample(Status)), "unknown field": msgpack.packb(fields | {"extra": 1}),
+           "missing field": msgpack.packb({k: v for k, v in fields.items() if k != array}),
+           "no array": msgpack.packb(fields | {array: [1.0]})}
+    real = [n for n in array_fields(topic.type) if getattr(good, n).dtype.kind == "f"]
+    packed = encode(good)
+    value = getattr(good, real[0])
+    bad["not a number"] = packed.replace(value.tobytes(), np.full_like(value, np.nan).tobytes(), 1)
+    assert bad["not a number"] != packed
+    return bad
+
+
+@pytest.mark.parametrize(("name", "topic"), [(n, t) for n, s in SERVICES.items() for t in s.inputs],
+                         ids=lambda v: v if isinstance(v, str) else v.name)
+def test_malformed_messages_are_counted_said_and_survived(name, topic):
+    part = PARTS[0] if topic.parts else None
+    with closing(Running("local", wait_for=("nobody",))) as running:  # the simulator waits: nothing moves but this
+        _, before = running.until_status(name, lambda s: s.state == "ready")
+        for count, (kind, payload) in enumerate(nonsense(topic).items(), start=1):
+            running.listener.publish(topic, part, payload)
+            _, status = running.until_status(name, lambda s, n=before.refused + count: s.refused >= n)
+            assert status.note.startswith(f"refused: {topic.name}{f'/{part}' if part else ''}: "), kind
+            assert status.refused == before.refused + count
+            assert status.state == "ready"
+        if topic.parts:
+            running.listener.publish(topic, "stranger", encode(sample(topic.type, object="stranger")))
+            running.until_status(name, lambda s: "'stranger' is not an object" in s.note)
+            running.listener.publish(topic, part, encode(sample(topic.type, object="can")))
+            running.until_status(name, lambda s: "object: 'can'" in s.note)
+        for service in SERVICES:
+            if service != "simulator":
+                running.listener.publish(STATUS, "nobody", encode(sample(Status, service="nobody", state="ready")))
+        seen = running.until(lambda t, p, b: t == RESULT and decode(t.type, b).episode == CONFIG.scene.count - 1)
+        assert by_key(e for e in seen if e[0] == RESULT)[("result", None)] == locally(encoded=True)["result", None]
+
+
+def test_a_stray_message_of_another_run_or_step_does_not_stop_the_loop():
+    with closing(Running("local", wait_for=("nobody",))) as running:
+        running.until_status("planner", lambda s: s.state == "ready")
+        for topic, part in ((PERCEPT, "mug"), (GOAL_PERCEPT, "can"), (BELIEF, "mug")):
+            running.listener.publish(topic, part, encode(sample(topic.type, run="other", step=9, object=part)))
+        running.listener.publish(ACTION, None, encode(sample(ACTION.type, run="r", episode=0, step=4)))
+        running.listener.publish(STATUS, "nobody", encode(sample(Status, service="nobody", state="ready")))
+        seen = running.until(lambda t, p, b: t == RESULT and decode(t.type, b).episode == CONFIG.scene.count - 1)
+        assert by_key(e for e in seen if e[0] == RESULT)[("result", None)] == locally(encoded=True)["result", None]
+
+
+def test_the_source_begins_when_everyone_is_ready():
+    with closing(Running("local", names=("simulator",), wait_for=("perception", "planner"))) as running:
+        running.until_status("simulator", lambda s: "perception, planner" in s.note)
+        for name, state in (("perception", "ready"), ("planner", "starting"), ("planner", "busy")):
+            assert running.health == {}
+            running.listener.publish(STATUS, name, encode(sample(Status, service=name, state=state)))
+        seen = running.until(lambda t, p, b: t == FRAME)
+        states = [decode(Status, b).state for t, p, b in seen if t == STATUS and p == "planner"]
+        assert states == ["starting", "busy"]
+
+
+class Recorder:
+    """A core that keeps its inputs; publishes what it is told to."""
+
+    def __init__(self, outputs=()) -> None:
+        self.steps, self.begun, self.outputs = [], [], outputs
+
+    def begin(self, run, episode):
+        self.begun.append((run, episode))
+        return ()
+
+    def step(self, inputs):
+        self.steps.append(inputs)
+        return self.outputs
+
+
+BOTH = Service("both", inputs=(PERCEPT, TRUTH, GOAL), trigger=TRUTH, outputs=(PLAN,))
+
+
+def offer(stepper, topic, part=None, **changes) -> bool:
+    """Offers a sample; whether the core stepped."""
+    extra = {"object": part} if part else {}
+    stepper.offer(topic, part, sample(topic.type, **{"run": "r", "episode": 0, "step": 0} | extra | changes))
+    return stepper.advance() is not None
+
+
+def test_a_step_needs_every_topic_every_part_and_what_is_latched():
+    stepper = Stepper(BOTH, core := Recorder(), PARTS)
+    assert not offer(stepper, PERCEPT, "can")
+    assert not offer(stepper, TRUTH)
+    assert stepper.waits_for() == ["percept/mug of step 0 of episode 0", "goal of step 0 of episode 0"]
+    assert not offer(stepper, PERCEPT, "mug")
+    assert offer(stepper, GOAL)
+    assert list(core.steps[0]["percept"]) == list(PARTS)
+    assert list(core.steps[0]) == ["percept", "truth", "goal"]
+    assert core.begun == [("r", 0)]
+
+
+def test_a_latched_message_holds_from_its_step_on():
+    stepper = Stepper(Service("s", inputs=(TRUTH, GOAL), trigger=TRUTH, outputs=()), core := Recorder(), PARTS)
+    offer(stepper, GOAL, step=0, seq=0)
+    offer(stepper, GOAL, step=2, seq=1)
+    for step in range(4):
+        assert offer(stepper, TRUTH, step=step)
+    assert [inputs["goal"].seq for inputs in core.steps] == [0, 0, 1, 1]
+
+
+def test_a_new_episode_begins_with_its_first_complete_step():
+    stepper = Stepper(BOTH, core := Recorder(), ("mug",))
+    for episode in (0, 1):
+        offer(stepper, GOAL, episode=episode)
+        offer(stepper, PERCEPT, "mug", episode=episode)
+    assert offer(stepper, TRUTH, episode=0)
+    assert core.begun == [("r", 0)]
+    assert offer(stepper, TRUTH, episode=1)
+    assert core.begun == [("r", 0), ("r", 1)]
+    assert not offer(stepper, TRUTH, episode=0, step=5)
+    assert stepper.skipped == 0
+
+
+def test_an_incomplete_step_is_skipped_once_a_later_one_is_complete():
+    stepper = Stepper(BOTH, core := Recorder(), ("mug",))
+    offer(stepper, GOAL)
+    offer(stepper, TRUTH, step=0)
+    offer(stepper, TRUTH, step=1)
+    assert offer(stepper, PERCEPT, "mug", step=1)
+    assert stepper.skipped == 1
+    assert not offer(stepper, PERCEPT, "mug", step=0)
+    assert [inputs["truth"].step for inputs in core.steps] == [1]
+
+
+def test_a_second_message_of_a_step_and_a_wrong_step_for_a_source_are_refused():
+    stepper = Stepper(BOTH, Recorder(), PARTS)
+    offer(stepper, TRUTH)
+    with pytest.raises(MessageError, match="second"):
+        offer(stepper, TRUTH)
+    with pytest.raises(MessageError, match="not an input"):
+        offer(stepper, PLAN)
+    simulator = Stepper(*pairs(CONFIG)[0], PARTS, source=True)
+    simulator.begin("r", 0)
+    with pytest.raises(MessageError, match="step: 3, not 0"):
+        offer(simulator, ACTION, step=3)
+
+
+def test_stray_steps_do_not_pile_up():
+    stepper = Stepper(BOTH, Recorder(), PARTS)
+    for step in range(5000):
+        offer(stepper, TRUTH, step=step)
+        offer(stepper, GOAL, episode=step)
+    assert len(stepper._slots) + len(stepper._latched) < 1000
+    assert stepper.skipped > 4000
+
+
+def test_gaps_are_counted_per_key():
+    counter = GapCounter()
+    lost = [counter.lost(PERCEPT, part, sample(PERCEPT.type, run="r", seq=seq))
+            for part, seq in (("mug", 4), ("can", 0), ("mug", 5), ("can", 3), ("mug", 9), ("mug", 0), ("mug", 1))]
+    assert lost == [0, 0, 0, 2, 3, 0, 0]
+    assert GapCounter(from_start=True).lost(PERCEPT, "mug", sample(PERCEPT.type, seq=4)) == 4
+
+
+def test_lost_messages_show_in_the_status():
+    with closing(Running("local", names=("evaluator",))) as running:
+        running.until_status("evaluator", lambda s: s.state == "ready")
+        for seq in (0, 1, 5):
+            running.listener.publish(TRUTH, None, encode(sample(TRUTH.type, step=seq, seq=seq, done=False)))
+        _, status = running.until_status("evaluator", lambda s: s.received == 3)
+        assert status.gaps == 3
+
+
+def test_settled_arrays_are_aligned_frozen_and_no_ones_else():
+    message = sample(FRAME.type)
+    buffer = np.frombuffer(b"x" + message.depth_m.tobytes(), "f4", offset=1).reshape(message.depth_m.shape)
+    settled = settle(dataclasses.replace(message, depth_m=buffer))
+    for value in (settled.rgb, settled.depth_m, settled.world_from_camera):
+        assert value.flags.aligned
+        assert value.flags.c_contiguous
+        assert not value.flags.writeable
+    assert not np.shares_memory(settled.rgb, message.rgb)
+    assert settle(settled) is settled
+    assert encode(settled) == encode(message)
+
+
+def test_a_core_that_gives_an_invalid_message_publishes_nothing_of_that_step():
+    bad = [Output(PLAN, sample(PLAN.type)), Output(PLAN, sample(PLAN.type, g_pose=float("nan")))]
+    bus, inbox, seen = LocalBus(), Inbox(), queue.SimpleQueue()
+    bus.subscribe([PLAN, STATUS], lambda *item: seen.put(item))
+    service = Service("bad", inputs=(TRUTH,), trigger=TRUTH, outputs=(PLAN,))
+    bus.subscribe([TRUTH], lambda *item: None)
+    thread = threading.Thread(target=serve, args=(service, Recorder(bad), bus, PARTS), kwargs={"run": "r", "inbox": inbox})
+    thread.start()
+    while decode(Status, seen.get(timeout=WAIT_S)[2]).state != "ready":
+        pass
+    bus.publish(TRUTH, None, encode(sample(TRUTH.type)))
+    while (status := decode(Status, seen.get(timeout=WAIT_S)[2])).refused == 0:
+        pass
+    inbox.stop()
+    thread.join(WAIT_S)
+    assert "invalid plan: g_pose: not a finite number" in status.note
+    assert status.published == 0
+
+
+def test_a_run_that_halts_says_who_waits_for_what():
+    deaf = [(s, c) for s, c in pairs(CONFIG) if s.name != "perception"]
+    with pytest.raises(SaccadeError, match="nobody has anything to do"):
+        run_local(deaf, PARTS, "r")
+    fakes = dict((s.name, (s, c)) for s, c in pairs(CONFIG))
+    fakes["perception"] = (fakes["perception"][0], type(fakes["perception"][1])(("mug",)))
+    with pytest.raises(SaccadeError, match="belief waits for percept/can of step 0 of episode 0"):
+        run_local(list(fakes.values()), PARTS, "r")
+
+
+@pytest.mark.parametrize(("changes", "expected"), [
+    ({"nonsense": 1}, "nonsense"), ({"bus": {"endpoint": "tcp/127.0.0.1:0"}}, "launcher"),
+    ({"scene": {"names": None}}, "scene.names")])
+def test_a_service_that_cannot_run_says_so_in_one_line(tmp_path, capsys, changes, expected):
+    path = tmp_path / "config.json"
+    path.write_text(json.dumps({"scene": {"names": list(PARTS)}} | changes))
+    with pytest.raises(SystemExit) as caught:
+        main(SERVICES["planner"], lambda config: FakePlanner(), argv=["--config", str(path)])
+    assert caught.value.code == 2
+    error = capsys.readouterr().err
+    assert error.startswith("saccade: ")
+    assert error.count("\n") == 1
+    assert expected in error

@@ -1,0 +1,144 @@
+"""What is encoded comes back the same; what is not a message is refused, and the field that is wrong is named."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import msgpack
+import numpy as np
+import pytest
+
+from shared import messages
+from shared.messages import ARRAY_EXTENSION, MAX_BYTES, MAX_SIDE, MAX_TEXT, Frame, Message, MessageError, decode, encode
+from shared.topics import TOPICS
+from tests.samples import array_fields, sample
+
+TYPES = sorted({topic.type for topic in TOPICS.values()}, key=lambda t: t.__name__)
+every_type = pytest.mark.parametrize("kind", TYPES, ids=lambda t: t.__name__)
+every_array = pytest.mark.parametrize(("kind", "name"), [(t, n) for t in TYPES for n in array_fields(t)],
+                                      ids=lambda v: v if isinstance(v, str) else v.__name__)
+
+
+def equal(a: Message, b: Message) -> bool:
+    """Field by field, arrays by dtype and value."""
+    for field in dataclasses.fields(a):
+        x, y = getattr(a, field.name), getattr(b, field.name)
+        if isinstance(x, np.ndarray) or isinstance(y, np.ndarray):
+            if not (isinstance(x, np.ndarray) and isinstance(y, np.ndarray) and x.dtype == y.dtype and
+                    np.array_equal(x, y)):
+                return False
+        elif x != y or type(x) is not type(y):
+            return False
+    return type(a) is type(b)
+
+
+def wire(message: Message, **changes) -> bytes:
+    """The message's map with some entries replaced (None of them checked) or, where the value is `...`, left out."""
+    fields = {"type": type(message).__name__, "version": message.VERSION}
+    fields |= {f.name: getattr(message, f.name) for f in dataclasses.fields(message)} | changes
+    return msgpack.packb({k: v for k, v in fields.items() if v is not ...}, default=messages._pack_array)
+
+
+@every_type
+def test_round_trip(kind):
+    original = sample(kind)
+    assert equal(decode(kind, encode(original)), original)
+    assert encode(decode(kind, encode(original))) == encode(original)
+
+
+@every_type
+def test_optional_fields_may_be_absent(kind):
+    optional = [n for n, h in messages.field_types(kind).items() if type(None) in getattr(h, "__args__", ())]
+    original = sample(kind, **dict.fromkeys(optional))
+    assert equal(decode(kind, encode(original)), original)
+
+
+@every_type
+def test_fields_missing_unknown_or_of_another_type_are_refused(kind):
+    message = sample(kind)
+    for name in messages.field_types(kind):
+        with pytest.raises(MessageError, match=f"{name}: missing"):
+            decode(kind, wire(message, **{name: ...}))
+        with pytest.raises(MessageError, match=f"{name}: "):
+            decode(kind, wire(message, **{name: {"a": 1}}))
+    with pytest.raises(MessageError, match="extra: unknown"):
+        decode(kind, wire(message, extra=1))
+    with pytest.raises(MessageError, match="version"):
+        decode(kind, wire(message, version=kind.VERSION + 1))
+
+
+@every_type
+def test_another_types_message_is_refused(kind):
+    other = next(t for t in TYPES if t is not kind)
+    with pytest.raises(MessageError, match="type"):
+        decode(kind, encode(sample(other)))
+
+
+@every_type
+def test_what_is_not_msgpack_is_refused(kind):
+    whole = encode(sample(kind))
+    for payload in (b"", b"\xc1", b"hello", whole[:-1], whole + b"\x00", msgpack.packb([1, 2]), msgpack.packb(7)):
+        with pytest.raises(MessageError):
+            decode(kind, payload)
+
+
+@every_type
+def test_oversized_payloads_and_texts_are_refused(kind):
+    with pytest.raises(MessageError, match=str(MAX_BYTES)):
+        decode(kind, bytes(MAX_BYTES + 1))
+    with pytest.raises(MessageError):
+        decode(kind, wire(sample(kind), run="x" * (MAX_TEXT + 1)))
+
+
+@every_type
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), True, "1"])
+def test_numbers_are_finite(kind, value):
+    for name, hint in messages.field_types(kind).items():
+        if hint is float:
+            with pytest.raises(MessageError, match=name):
+                decode(kind, wire(sample(kind), **{name: value}))
+            with pytest.raises(MessageError, match=name):
+                encode(sample(kind, **{name: value}))
+
+
+@every_type
+@pytest.mark.parametrize("value", [-1, 2 ** 63, 1.0, True])
+def test_counts_are_whole_and_in_range(kind, value):
+    for name in ("episode", "step", "seq"):
+        with pytest.raises(MessageError, match=name):
+            decode(kind, wire(sample(kind), **{name: value}))
+
+
+@every_array
+def test_arrays_of_another_dtype_or_shape_are_refused(kind, name):
+    message = sample(kind)
+    good = getattr(message, name)
+    other = np.zeros(good.shape, "f4" if good.dtype != np.float32 else "f8")
+    for bad in (other, good[None], good.ravel()[0], good.tolist()):
+        with pytest.raises(MessageError, match=name):
+            decode(kind, wire(message, **{name: bad if not np.isscalar(bad) else float(bad)}))
+    if good.dtype.kind == "f":
+        for value in (np.nan, np.inf):
+            bad = good.copy()
+            bad.flat[-1] = value
+            with pytest.raises(MessageError, match=name):
+                decode(kind, wire(message, **{name: bad}))
+
+
+def test_dimensions_of_the_same_name_must_agree():
+    message = sample(Frame)
+    with pytest.raises(MessageError, match="depth_m"):
+        encode(dataclasses.replace(message, depth_m=message.depth_m[:-1]))
+
+
+@pytest.mark.parametrize("data", [
+    b"", b"\x92", msgpack.packb(["O", [1]]) + bytes(8), msgpack.packb(["f8", [2]]) + bytes(8),
+    msgpack.packb(["f8", [-1]]), msgpack.packb(["f8", [MAX_SIDE + 1]]) + bytes(8 * (MAX_SIDE + 1)),
+    msgpack.packb(["f8", [2 ** 40, 2 ** 40]]), msgpack.packb(["f8", ["4"]]) + bytes(32), msgpack.packb({"f8": 1}),
+], ids=range(9))
+def test_array_headers_are_checked(data):
+    payload = wire(sample(messages.Action), translation_m=msgpack.ExtType(ARRAY_EXTENSION, data))
+    with pytest.raises(MessageError):
+        decode(messages.Action, payload)
+    with pytest.raises(MessageError):
+        decode(messages.Action, wire(sample(messages.Action), translation_m=msgpack.ExtType(2, bytes(24))))
