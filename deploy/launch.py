@@ -25,6 +25,7 @@ from shared.topics import RESULT, STATUS, Topic
 
 OnMessage = Callable[[Topic, str | None, Message], None]
 CONFIG_NAME = "config.json"
+LOG_NAME = "run.mcap"
 LOGS_NAME = "logs"
 READY_S = 120.0  # loading weights on a busy machine takes its time
 STOP_S = 10.0  # then a service that was told to stop is killed
@@ -52,8 +53,7 @@ def launch(config: Config, run_dir: Path, on_message: OnMessage | None = None,
     `on_message(topic, part, message)` sees every valid message, on the caller's thread. The first process is the
     source. Raises SaccadeError, naming the service, if one ends before its time or is not ready within READY_S.
     """
-    run_dir.mkdir(parents=True, exist_ok=True)
-    (run_dir / LOGS_NAME).mkdir(exist_ok=True)
+    _prepare(run_dir)
     config = resolve(config, processes)
     config.save(run_dir / CONFIG_NAME)
     arrived: queue.SimpleQueue = queue.SimpleQueue()
@@ -78,6 +78,15 @@ def resolve(config: Config, processes: Sequence[Process] = PROCESSES) -> Config:
     names = config.scene.names or names_of(config.scene.objects)
     return config.with_values({"bus.endpoint": free_endpoint(config.bus.endpoint), "scene.names": list(names),
                                "bus.wait_for": [process.name for process in processes[1:]]})
+
+
+def _prepare(run_dir: Path) -> None:
+    if (run_dir / LOG_NAME).exists():
+        raise SaccadeError(f"run folder {run_dir} already holds a log; choose another, or move it away")
+    try:
+        (run_dir / LOGS_NAME).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise SaccadeError(f"run folder {run_dir} cannot be made: {error.strerror}") from error
 
 
 def _start(process: Process, run_dir: Path) -> subprocess.Popen:

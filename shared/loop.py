@@ -18,6 +18,8 @@ from shared.topics import STATUS, Topic
 
 OnMessage = Callable[[Topic, str | None, Message, bytes | None], None]
 READY_STATES = ("ready", "busy")
+IDLE_S = 2.0  # after so long a service says what it waits for
+WAITS = "waits for "
 
 
 def main(service: Service, build: Callable[[Config], Core], *, source: bool = False,
@@ -49,10 +51,13 @@ def serve(service: Service, core: Core, bus: Bus, parts: tuple[str, ...], *, run
     loop = _Loop(service, core, bus, parts, run, source, wait_for)
     bus.subscribe(service.inputs + ((STATUS,) if loop.awaited else ()), inbox.put)
     with Heartbeat(bus, loop.health, inbox.stop):
-        loop.health.say("ready", f"waits for {', '.join(sorted(loop.awaited))}" if loop.awaited else "")
+        loop.health.say("ready", WAITS + ", ".join(sorted(loop.awaited)) if loop.awaited else "")
         loop.begin_if_due()
-        for topic, part, payload in inbox.items(0.0 if source else DRAIN_S):
-            loop.handle(topic, part, payload)
+        for item in inbox.items(0.0 if source else DRAIN_S, tick_s=IDLE_S):
+            if item is None:
+                loop.say_what_lacks()
+            else:
+                loop.handle(*item)
     return loop.health
 
 
@@ -92,6 +97,11 @@ class _Loop:
             episode, self._episode = self._episode, self._episode + 1
             self._step(None, None, lambda e=episode: self._stepper.begin(self._run, e))
 
+    def say_what_lacks(self) -> None:
+        """Nothing has come for a while: puts the inputs that the next step still needs into the status."""
+        if lacks := self._stepper.waits_for():
+            self.health.say(note=WAITS + ", ".join(lacks))
+
     def _note_status(self, part: str | None, payload: bytes) -> None:
         try:
             status = decode(STATUS.type, payload)
@@ -113,6 +123,8 @@ class _Loop:
                 return False
             self.health.milliseconds = (time.perf_counter() - start) * 1e3
             self._publish(outputs)
+            if self.health.note.startswith(WAITS):
+                self.health.say(note="")
         except MessageError as error:
             if topic is None:
                 name = self.health.service
@@ -162,5 +174,5 @@ def run_local(pairs: Sequence[tuple[Service, Core]], parts: tuple[str, ...], run
                 while (outputs := stepper.advance()) is not None:
                     waiting.extend(outputs)
         if not source.episode_done:
-            lacks = [f"{s.service.name} waits for {', '.join(s.waits_for())}" for s in steppers if s.waits_for()]
+            lacks = [f"{s.service.name} {WAITS}{', '.join(s.waits_for())}" for s in steppers if s.waits_for()]
             raise SaccadeError(f"episode {episode} came to a halt: {'; '.join(lacks) or 'nobody has anything to do'}")

@@ -162,10 +162,12 @@ def run_process(name: str, work: Callable[[Config, Path, Inbox], None], *, inbox
             os._exit(128 + number)
         inbox.stop()
 
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, on_signal)
+    before = {number: signal.signal(number, on_signal) for number in (signal.SIGTERM, signal.SIGINT)}
     try:
         work(load(arguments.config), arguments.config.resolve().parent, inbox)
     except SaccadeError as error:
         print(f"saccade: {error}", file=sys.stderr, flush=True)
         sys.exit(EXIT_ERROR)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -40,7 +40,7 @@ class RecordingStopped(SaccadeError):
 class RunLog:
     """Writes one run's log. `metadata`: names to maps of text, such as versions and weights' hashes.
 
-    Raises SaccadeError if the file cannot be created, RecordingStopped when it can take no more, once.
+    Raises SaccadeError if the file cannot be created or is there already, RecordingStopped when it can take no more, once.
     """
 
     def __init__(self, path: Path, *, world: str, configuration: str = "{}",
@@ -112,7 +112,7 @@ class _WholeRecords:
     """The file below mcap's Writer, which writes whole records only: of one that does not fit nothing is left."""
 
     def __init__(self, path: Path) -> None:
-        self._raw = path.open("wb", buffering=0)
+        self._raw = path.open("xb", buffering=0)  # a log is never written over
         self._end = 0
 
     def write(self, data: bytes) -> int:

@@ -1,7 +1,7 @@
 """Trained weights: a folder of safetensors in half precision with a manifest that is verified on loading.
 
-`manifest.json` says what the weights are (data, seed, steps, losses, commit, where trained), the measures of each object
-and the SHA-256 of every file.
+`manifest.json` says what the weights are (data, seed, steps, losses, commit, where trained), the measures of each
+object and the SHA-256 of every file.
 """
 
 from __future__ import annotations

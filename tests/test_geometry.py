@@ -29,7 +29,7 @@ def rng():
 
 def test_look_at_puts_the_target_on_the_principal_point(rng):
     """The crop's principal point is off the image's centre; the target lands on it, not on (240, 240)."""
-    cameras, targets = rng.uniform(-1, 1, (200, 3)) + (0, 0, 2), rng.uniform(-0.3, 0.3, (200, 3))
+    cameras, targets = rng.uniform((-1, -1, 1), (1, 1, 3), (200, 3)), rng.uniform(-0.3, 0.3, (200, 3))
     poses = look_at(cameras, targets)
     for pose, target, camera in zip(poses, targets, cameras, strict=True):
         pixel, depth = project(target, pose, INTRINSICS_PX)
@@ -49,7 +49,8 @@ def test_look_at_has_no_roll_and_is_a_rotation(rng):
     np.testing.assert_allclose(-rotation[:, :, 2], unit(forward), atol=1e-12)
     np.testing.assert_allclose(rotation[:, 2, 0], 0.0, atol=1e-12)  # the image's right stays level
     assert (rotation[:, 2, 1] >= -1e-12).all()  # the image's top points up
-    np.testing.assert_allclose(np.einsum("nij,nik->njk", rotation, rotation), np.tile(np.eye(3), (300, 1, 1)), atol=1e-12)
+    squared = np.einsum("nij,nik->njk", rotation, rotation)
+    np.testing.assert_allclose(squared, np.tile(np.eye(3), (300, 1, 1)), atol=1e-12)
     np.testing.assert_allclose(np.linalg.det(rotation), 1.0)
 
 

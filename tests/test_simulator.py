@@ -1,17 +1,14 @@
-"""The simulator's core and the evaluator's: what an episode publishes, and bad input that is refused in one line."""
+"""The simulator's core: what an episode publishes, and bad input that is refused in one line."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from services.evaluator.core import Evaluator
 from services.simulator.core import SERVICE, Simulator, build, names_in_use, read_goal_image, scenes_of
 from services.simulator.objects import load_mesh
 from services.simulator.scenes import generate_scene, save_scenes
@@ -171,32 +168,6 @@ def test_an_absent_target_is_in_the_goal_image_only(world, scenes):
     assert outputs["truth"].names == ["rice_box"]
     assert set(world.poses) == {"rice_box"}
     np.testing.assert_array_equal(outputs["truth"].target_center_m, scene.target_placed.center_m)
-
-
-def test_the_evaluator_says_how_it_ended(world, scenes):
-    simulator, evaluator = Simulator(world, scenes, max_steps=2), Evaluator()
-    evaluator.begin("r", 0)
-    assert evaluator.step(by_topic(simulator.begin("r", 0))) == []
-    assert evaluator.step(by_topic(simulator.step(act(0, arrived=True)))) == []
-    result = evaluator.step(by_topic(simulator.step(act(1))))[0].message
-    assert (result.scene, result.target, result.objects, result.steps) == ("soup_can", "soup_can", 2, 2)
-    assert (result.success, result.declared, result.declared_true) == (False, True, False)
-    assert result.azimuth_error_rad > 0
-    encode(result)
-
-
-def test_a_perfect_arrival_has_no_errors(world, scenes):
-    simulator = Simulator(world, scenes)
-    simulator.begin("r", 0)
-    result = Evaluator().step(by_topic(simulator.step(home(simulator))))[0].message
-    assert result.success
-    assert (result.azimuth_error_rad, result.elevation_error_rad, result.range_error_m) == pytest.approx((0, 0, 0))
-
-
-def test_the_evaluator_loads_neither_torch_nor_mujoco():
-    code = "import sys, services.evaluator.core; print(sorted({'torch', 'mujoco'} & set(sys.modules)))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
 
 
 @pytest.mark.parametrize("suffix", ["png", "jpg"])

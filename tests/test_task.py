@@ -122,7 +122,7 @@ def test_errors_are_differences_in_spherical_coordinates_and_wrap():
     assert elevation == pytest.approx(0.0)
     assert distance == pytest.approx(0.1)
     up = center + 0.3 * np.array([0.0, -1.0, 1.0]) / np.sqrt(2)
-    assert errors(up, center + (0.0, -0.3, 0.0), center) == pytest.approx((0.0, np.pi / 4, 0.0), abs=1e-12)
+    assert errors(up, center - np.array([0.0, 0.3, 0.0]), center) == pytest.approx((0.0, np.pi / 4, 0.0), abs=1e-12)
 
 
 def test_an_episode_ends_at_the_goal():

@@ -92,7 +92,7 @@ def test_objects_appear_where_the_intrinsics_say(world, camera):
             pixels, _ = project(triangles_of(world).reshape(-1, 3), camera, INTRINSICS_PX)
             seen = np.array([columns.min(), rows.min(), columns.max() + 1, rows.max() + 1])
             expected = np.concatenate([pixels.min(0), pixels.max(0)])
-            assert 0 < expected.min(), "the object must lie within the image"
+            assert expected.min() > 0, "the object must lie within the image"
             assert expected.max() < 480
             assert np.abs(seen - expected).max() < 1.0
     finally:

@@ -78,7 +78,7 @@ def adapt(lambdas: list[float], errors: list[float]) -> list[float]:
 
 
 def identity_loss(identity: Identity, batch: CropBatch) -> Tensor:
-    """Presence (binary cross entropy) and the correction's Gaussian negative log likelihood where the object is seen."""
+    """Presence (binary cross entropy), and the correction's Gaussian negative log likelihood where it is seen."""
     logit, correction, log_std = identity(batch.raw.contiguous(memory_format=torch.channels_last))
     label = (batch.present & (batch.visible > 0.15)).float()
     clear = ((~batch.present) | (batch.visible > 0.3) | (batch.visible < 0.05)).float()

@@ -169,7 +169,7 @@ class FrameComposer:
             matrices = torch.as_tensor(np.stack([instances[n].tile_from_camera for n in chosen]), dtype=torch.float32)
             local = self.rays_t @ matrices.to(self.device).transpose(1, 2)  # [n, 14400, 3]
             ahead = local[..., 2:] > 1e-3
-            grid = torch.where(ahead, local[..., :2] / local[..., 2:].clamp(min=1e-3), torch.full_like(local[..., :2], 9))
+            grid = torch.where(ahead, local[..., :2] / local[..., 2:].clamp(min=1e-3), 9.0)
             drawn = F.grid_sample(tiles, grid.view(-1, INPUT_PX, INPUT_PX, 2), align_corners=False)
             for n, layer in zip(chosen, drawn, strict=True):
                 layers[n] = layer

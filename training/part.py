@@ -58,8 +58,8 @@ class CcnTask:
         self.config, self.device, self.lambdas, self.part = config, device, [80.0] * 3, part
 
     def generator(self, *key: int) -> torch.Generator:
-        seed = int(np.random.SeedSequence([self.config.seed, zlib.crc32(self.part.encode()), *key]).generate_state(1)[0])
-        return torch.Generator(self.device).manual_seed(seed)
+        entropy = [self.config.seed, zlib.crc32(self.part.encode()), *key]
+        return torch.Generator(self.device).manual_seed(int(np.random.SeedSequence(entropy).generate_state(1)[0]))
 
     def loss(self, step: int) -> tuple[Tensor, dict[str, float]]:
         generator, batch = self.generator(step), self.config.batch_ccn
@@ -103,10 +103,12 @@ class ExtractionTask:
         """Nothing adapts."""
 
     def evaluate(self) -> dict[str, float]:
-        return extraction_errors(self.module, self.composer.compose(200, np.random.default_rng([self.config.seed, 2 ** 31])))
+        rng = np.random.default_rng([self.config.seed, 2 ** 31])
+        return extraction_errors(self.module, self.composer.compose(200, rng))
 
     def draw(self, path: Path) -> None:
-        draw_extraction(path, self.module, self.composer.compose(6, np.random.default_rng([self.config.seed, 2 ** 31])))
+        rng = np.random.default_rng([self.config.seed, 2 ** 31])
+        draw_extraction(path, self.module, self.composer.compose(6, rng))
 
 
 def rate_at(step: int, steps: int, peak: float) -> float:

@@ -35,7 +35,8 @@ class BeliefFilter:
     def begin(self, run: str, episode: int) -> Iterable[Output]:
         """A new scene: nothing is known."""
         self.episode = episode
-        self.positions = {name: PositionFilter(self.config.belief, self._rng(0, f"start {name}")) for name in self.names}
+        self.positions = {name: PositionFilter(self.config.belief, self._rng(0, f"start {name}"))
+                          for name in self.names}
         self.goal_views: dict[str, GoalView] = {}
         self.goal_known = False
         return ()

@@ -1,7 +1,7 @@
 """From where an object would look like the goal: a posterior over its viewing hemisphere, fused over all views.
 
-Each view's latent pose is moved by every displacement to the cells of a grid; a cell is as likely as the goal's latent is
-under the moved one (paper, equations 2 and 5). Views at different places multiply; their disagreement is what makes the
+Each view's latent pose is moved by every displacement to the cells of a grid; a cell is as likely as the goal's latent
+is under the moved one (paper, equations 2 and 5). Views at different places multiply; their disagreement is what makes the
 posterior of a nearly symmetric object multi-modal, and new views decide between the modes.
 """
 

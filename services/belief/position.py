@@ -92,7 +92,7 @@ class PositionFilter:
 
     def missed(self, camera: Array, intrinsics_px: Array, seen: list[tuple[Evidence, float]],
                rng: np.random.Generator) -> None:
-        """Negative evidence: particles in view, not behind any object that is `seen` (with its radius, metres), lose."""
+        """Negative evidence: particles in view, not behind an object that is `seen` (with its radius, m), lose."""
         visible = in_view(self.particles, camera, intrinsics_px) & ~behind(self.particles, camera[:3, 3], seen)
         share = float(self.weights[visible].sum())
         self._reweigh(np.where(visible, self.config.missed_weight, 1.0), rng)

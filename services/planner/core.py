@@ -1,8 +1,8 @@
 """Chooses viewpoints by minimising expected free energy and moves the camera there in short steps (paper, section 3.3).
 
 Candidates are drawn by importance: mostly views of where the target is believed to be, from where the goal would look
-as it does. The viewpoint is chosen anew every few steps or on arrival; on arrival at the believed goal the agent says so,
-and goes on to the next likely view should it still be asked to act.
+as it does. The viewpoint is chosen anew every few steps or on arrival; on arrival at the believed goal the agent says
+so, and goes on to the next likely view should it still be asked to act.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from collections.abc import Iterable
 import numpy as np
 
 from services.planner.free_energy import Terms, expected_free_energy
-from services.planner.goal import Preference, aim, infer_preference
+from services.planner.goal import aim, infer_preference
 from services.planner.motion import step_towards
 from shared.config import Config
 from shared.errors import SaccadeError
-from shared.geometry import Array, direction, look_at, rotation_angle, spherical, unit, viewing_grid
+from shared.geometry import Array, direction, look_at, rotation_angle, unit, viewing_grid
 from shared.messages import Action, Belief, Plan
 from shared.seeding import generator
 from shared.service import Inputs, Output, Service

@@ -1,6 +1,8 @@
-"""Short steps towards a pose, around spheres that the camera may not enter. Used with believed and with true spheres."""
+"""Short steps towards a pose, around spheres that the camera may not enter: believed ones, or the true ones."""
 
 from __future__ import annotations
+
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,6 +17,8 @@ _SLACK_M = 1e-6  # a camera that was pushed onto a sphere is outside it
 _DETOUR = 1.12  # corners of a detour lie on a sphere this much larger: neighbours among 48 see each other past it
 _AZIMUTH, _ELEVATION = fibonacci_hemisphere(48)
 _CORNERS = direction(_AZIMUTH, np.arcsin(2.0 * np.sin(_ELEVATION) - 1.0))  # even over the whole sphere
+_SHELLS_M = np.arange(0.01, 0.5, 0.01)  # how far to look for a place outside all spheres
+_SHARES = np.linspace(0.0, 0.95, 20)  # of the way from a goal to a sphere's centre
 
 
 def step_towards(world_from_camera: ArrayLike, goal_world_from_camera: ArrayLike, spheres: Spheres,
@@ -22,13 +26,32 @@ def step_towards(world_from_camera: ArrayLike, goal_world_from_camera: ArrayLike
     """The next action, (translation [3] m, rotation [3] rad), on the way from a camera pose [4, 4] to a goal pose.
 
     Moves at most `step_m` along the shortest way found around the spheres, so the way left shrinks with every step and
-    the camera never gets stuck; a goal inside a sphere is approached as near as `clip` allows. Turns along the great
-    arc, at most 0.5 rad about each axis.
+    the camera never gets stuck. Only into a sphere, where goals may lie, the last move may be longer: see `reach`.
+    Turns along the great arc, at most 0.5 rad about each axis.
     """
     camera = np.asarray(world_from_camera, dtype=np.float64)
     goal = np.asarray(goal_world_from_camera, dtype=np.float64)
-    way = way_around(camera[:3, 3], goal[:3, 3], spheres)
-    return _along(way, step_m) - camera[:3, 3], turn_towards(camera[:3, :3], goal[:3, :3])
+    here, there = camera[:3, 3], goal[:3, 3]
+    way = way_around(here, there, spheres)
+    position = _along(way, step_m)
+    at_the_end = (position == way[-1]).all() or np.linalg.norm(here - there) <= step_m
+    if at_the_end and spheres.depth_m(there) > _SLACK_M:
+        position = reach(there, spheres, here)
+    return position - here, turn_towards(camera[:3, :3], goal[:3, :3])
+
+
+def reach(goal: ArrayLike, spheres: Spheres, start: ArrayLike) -> Array:
+    """The position [3] to command from `start` for which `clip` leaves the camera nearest to the goal.
+
+    A sphere pushes whatever is on the ray from its centre through the goal to the same place, past the spheres before
+    it: so some goals inside a sphere are reached by a command that lies deep in another.
+    """
+    goal = np.asarray(goal, dtype=np.float64)
+    rays = goal + _SHARES[:, None, None] * (spheres.centers_m - goal)
+    commands = np.concatenate([_outside(goal, spheres)[None], rays.reshape(-1, 3)])
+    misses = np.array([np.linalg.norm(clip(command, spheres) - goal) for command in commands]).round(4)
+    misses[(np.abs(commands - start) > ACTION_LIMIT).any(axis=1)] = np.inf
+    return commands[np.argmin(misses)]
 
 
 def turn_towards(rotation: ArrayLike, goal_rotation: ArrayLike) -> Array:
@@ -44,12 +67,12 @@ def turn_towards(rotation: ArrayLike, goal_rotation: ArrayLike) -> Array:
 
 
 def way_around(start: ArrayLike, goal: ArrayLike, spheres: Spheres) -> Array:
-    """Corner points [K, 3] of a way from start to goal that stays outside the spheres; the straight one where it is free.
+    """Corner points [K, 3] of a way from start to goal outside the spheres; the straight one where it is free.
 
     A start inside a believed sphere is taken as on its surface: the camera is there, so the belief is off.
     """
     start = np.asarray(start, dtype=np.float64)
-    goal = clip(goal, spheres)
+    goal = _outside(goal, spheres)
     distances = np.linalg.norm(spheres.centers_m - start, axis=1)
     spheres = Spheres(spheres.centers_m, np.minimum(spheres.radii_m, distances) - _SLACK_M)
     if _free(start[None], goal[None], spheres)[0, 0]:
@@ -74,6 +97,21 @@ def _corners(start: Array, goal: Array, spheres: Spheres) -> Array:
     outwards = [end + reach * away for end in (start, goal) for away in unit(end - spheres.centers_m)
                 for reach in (0.02, 0.05)]
     points = np.concatenate([around.reshape(-1, 3), above, outwards])
+    return _allowed(points, spheres)
+
+
+def _outside(position: ArrayLike, spheres: Spheres) -> Array:
+    """The position [3] after `clip`; where that is inside a sphere, the nearest found [3] that is in none."""
+    clipped = clip(position, spheres)
+    if spheres.depth_m(clipped) <= _SLACK_M:
+        return clipped
+    around = _allowed((clipped + _SHELLS_M[:, None, None] * _CORNERS).reshape(-1, 3), spheres)
+    nearest = np.linalg.norm(around - position, axis=1)
+    return around[np.argmin(nearest)] if len(around) else clipped
+
+
+def _allowed(points: Array, spheres: Spheres) -> Array:
+    """Those of the points [K, 3] that are in the workspace and in no sphere."""
     inside_workspace = ((points >= LOWER_M) & (points <= UPPER_M)).all(axis=1)
     outside = (np.linalg.norm(points[:, None] - spheres.centers_m, axis=-1) >= spheres.radii_m).all(axis=1)
     return points[inside_workspace & outside]
@@ -95,7 +133,7 @@ def _free(starts: Array, ends: Array, spheres: Spheres) -> np.ndarray:
 
 def _along(way: Array, distance_m: float) -> Array:
     """The point [3] this far along a way [K, 3], or its end."""
-    for here, there in zip(way[:-1], way[1:], strict=True):
+    for here, there in pairwise(way):
         length = np.linalg.norm(there - here)
         if length > distance_m:
             return here + (there - here) * (distance_m / length)

@@ -6,7 +6,7 @@ from services.planner.motion import STEP_M, step_towards
 from shared.config import Config
 from shared.messages import Action, Truth
 from shared.service import Inputs, Output, Service
-from shared.task import Spheres, apply_action, success
+from shared.task import Spheres, apply_action, clip, success
 from shared.topics import ACTION, TRUTH
 
 SERVICE = Service("oracle", inputs=(TRUTH,), trigger=TRUTH, outputs=(ACTION,))
@@ -29,7 +29,9 @@ class Oracle:
             return []
         spheres = Spheres(truth.centers_m, truth.keep_out_m)
         move = step_towards(truth.world_from_camera, truth.goal_world_from_camera, spheres, self.step_m)
-        arrived = success(apply_action(truth.world_from_camera, *move), truth.goal_world_from_camera)
+        camera = apply_action(truth.world_from_camera, *move)
+        camera[:3, 3] = clip(camera[:3, 3], spheres)
+        arrived = success(camera, truth.goal_world_from_camera)
         action = Action(run=truth.run, episode=truth.episode, step=truth.step, translation_m=move[0],
                         rotation_rad=move[1], arrived=arrived)
         return [Output(ACTION, action)]

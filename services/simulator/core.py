@@ -27,8 +27,9 @@ SERVICE = Service("simulator", inputs=(ACTION,), trigger=ACTION, outputs=(FRAME,
 class Simulator:
     """One world, episode after episode. Episode k is scene k; `episodes` says how many there are.
 
-    Every step gives the Truth and, until the episode is done, a Frame. With `goal_rgb` [H, W, 3] the user's image stands
-    in for the scene's goal: its view is unknown, so no step is a success and the episode ends when the agent declares.
+    Every step gives the Truth and, until the episode is done, a Frame. With `goal_rgb` [H, W, 3] the user's image
+    stands in for the scene's goal: its view is unknown, so no step is a success and the agent's declaration ends the
+    episode.
     """
 
     def __init__(self, world: World, scenes: Sequence[Scene], *, max_steps: int = MAX_STEPS,
@@ -94,11 +95,12 @@ class Simulator:
 
     def _truth(self) -> Truth:
         scene, state, present = self.scene, self.state, self.scene.on_table
+        yaws = np.array([p.yaw_rad for p in present], dtype=np.float64)
         return Truth(**self._stamp(), scene=scene.id, target=scene.target, names=[p.name for p in present],
-                     centers_m=state.spheres.centers_m, yaws_rad=np.array([p.yaw_rad for p in present], dtype=np.float64),
-                     keep_out_m=state.spheres.radii_m, target_center_m=scene.target_placed.center_m,
-                     world_from_camera=state.camera, goal_world_from_camera=state.goal, success=state.success,
-                     done=self._done, declared=state.declared, declared_true=state.declared_true)
+                     centers_m=state.spheres.centers_m, yaws_rad=yaws, keep_out_m=state.spheres.radii_m,
+                     target_center_m=scene.target_placed.center_m, world_from_camera=state.camera,
+                     goal_world_from_camera=state.goal, success=state.success, done=self._done,
+                     declared=state.declared, declared_true=state.declared_true)
 
 
 def read_goal_image(path: Path) -> NDArray[np.uint8]:
@@ -122,7 +124,8 @@ def names_in_use(config: SceneConfig) -> tuple[str, ...]:
     available = names_of(config.objects)
     for name in config.names or ():
         if name not in available:
-            raise SaccadeError(f"scene.names: {name!r} is not in {config.objects!r}: choose from {', '.join(available)}")
+            choice = ", ".join(available)
+            raise SaccadeError(f"scene.names: {name!r} is not in {config.objects!r}: choose from {choice}")
     if config.names is not None and (not config.names or len(set(config.names)) < len(config.names)):
         raise SaccadeError("scene.names: name at least one object, each once")
     return config.names or available

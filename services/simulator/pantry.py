@@ -69,7 +69,7 @@ class Art:
         self.rect((x0, y0, x1, y1, WHITE))
         bits, pad = f"{number:b}", 0.1
         edges = np.linspace(x0 + pad * (x1 - x0), x1 - pad * (x1 - x0), len(bits) + 1)
-        for left, right, bit in zip(edges, edges[1:], bits):
+        for left, right, bit in zip(edges[:-1], edges[1:], bits, strict=True):
             if bit == "1":
                 self.rect((left, y0 + pad * (y1 - y0), right, y1 - pad * (y1 - y0), BLACK))
 
@@ -163,11 +163,11 @@ class Shape:
             picture = art.image.resize(self.lid_px, Image.Resampling.BOX)
             padded = np.pad(np.asarray(picture), [(_GUTTER_PX,) * 2] * 2 + [(0, 0)], mode="edge")
             atlas.paste(Image.fromarray(padded), (x - _GUTTER_PX, y - _GUTTER_PX))
-        points, pixels, faces = zip(self._side(), self._end(0), self._end(1))
+        points, pixels, faces = zip(self._side(), self._end(0), self._end(1), strict=True)
         starts = np.cumsum([0] + [len(p) for p in points[:-1]])
         texcoords = np.concatenate(pixels) / ATLAS_PX * (1, -1) + (0, 1)
         return Mesh(name, np.concatenate(points).astype(np.float32), texcoords.astype(np.float32),
-                    np.concatenate([f + s for f, s in zip(faces, starts)]).astype(np.int32), np.array(atlas))
+                    np.concatenate([f + s for f, s in zip(faces, starts[:-1], strict=True)]).astype(np.int32), np.array(atlas))
 
 
 def _coffee_can() -> Mesh:
@@ -313,7 +313,8 @@ def _squeeze_bottle() -> Mesh:
     return shape.mesh("squeeze_bottle", art, lid)
 
 
-_MAKERS = dict(zip(PANTRY_NAMES, (_coffee_can, _cereal_box, _rice_box, _soup_can, _squeeze_bottle)))
+_MAKERS = dict(zip(PANTRY_NAMES, (_coffee_can, _cereal_box, _rice_box, _soup_can, _squeeze_bottle),
+                   strict=True))
 
 
 def make_mesh(name: str) -> Mesh:

@@ -71,7 +71,7 @@ def load_scenes(path: Path, names: Sequence[str] | None = None) -> list[Scene]:
     try:
         tree = json.loads(path.read_text())
     except OSError as error:
-        raise SaccadeError(f"scenes {path} cannot be read ({error.strerror}): give the path of a scenes file") from error
+        raise SaccadeError(f"scenes {path} cannot be read ({error.strerror}): give a scenes file") from error
     except ValueError as error:
         raise SaccadeError(f"scenes {path} is not JSON ({error}): write it with save_scenes") from error
     entries = tree.get("scenes") if isinstance(tree, dict) else None

@@ -1,0 +1,29 @@
+# `make run`: set up and run one episode.  `make test`: set up and run all tests.
+PYTHON ?= python3
+SACCADE = .venv/bin/saccade
+
+.PHONY: run test lint bench clean
+
+run: .venv/.installed
+	$(SACCADE) run
+
+test: .venv/.installed-dev lint
+	.venv/bin/python -m pytest -q
+
+lint: .venv/.installed-dev
+	.venv/bin/ruff check .
+	.venv/bin/lint-imports
+
+bench: .venv/.installed
+	$(SACCADE) bench --objects pantry --jobs 2 --json bench/pantry.json
+
+.venv/.installed: pyproject.toml deploy/setup.sh
+	sh deploy/setup.sh $(PYTHON)
+	touch $@
+
+.venv/.installed-dev: .venv/.installed
+	.venv/bin/python -m pip install --quiet --editable '.[dev]'
+	touch $@
+
+clean:
+	rm -rf .venv build *.egg-info .pytest_cache .ruff_cache

@@ -1,0 +1,189 @@
+"""The front door: `saccade <command>`. Commands load what they need when they are called."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import typer
+
+from shared.errors import SaccadeError
+
+EXIT_ERROR, EXIT_INTERRUPTED = 2, 130
+
+app = typer.Typer(name="saccade", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
+                  help="An active-vision agent: it looks, believes and moves until it sees the goal image.")
+
+Objects = Annotated[Literal["pantry", "ycb"] | None, typer.Option(help="object set [default: pantry]")]
+Names = Annotated[str | None, typer.Option(help="only these objects of the set: a,b", metavar="NAMES")]
+ConfigFile = Annotated[Path | None, typer.Option(help="configuration, TOML or JSON; options go before it")]
+Values = Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE",
+                                                  help="configuration by dotted key, e.g. planner.step_m=0.03")]
+WeightsFolder = Annotated[Path | None, typer.Option(help="folder of the weights [default: weights/<set>]")]
+Seed = Annotated[int | None, typer.Option(min=0, help="seed of everything random [default: 0]")]
+Yaw = Annotated[Literal["random", "fixed"] | None, typer.Option(help="whether drawn objects are turned")]
+ScenesFile = Annotated[Path | None, typer.Option(help="scenes file")]
+
+
+@app.command()
+def run(*, objects: Objects = None, names: Names = None, scenes: ScenesFile = None,
+        scene: Annotated[str | None, typer.Option(help="id of one scene in the file")] = None, seed: Seed = None,
+        count: Annotated[int | None, typer.Option(min=1, help="how many scenes to draw")] = None,
+        n_objects: Annotated[int | None, typer.Option(min=1, help="objects on the table")] = None, yaw: Yaw = None,
+        goal: Annotated[Path | None, typer.Option(help="goal image, 480x480 PNG or JPEG")] = None,
+        explore: Annotated[bool, typer.Option("--explore", help="no goal: find out what is there")] = False,
+        out: Annotated[Path | None, typer.Option(help="folder of the run [default: runs/<time>-<seed>]")] = None,
+        bus: Annotated[Literal["zenoh", "local"] | None, typer.Option(
+            help="services as processes on Zenoh, or all within this one [default: zenoh]")] = None,
+        agent: Annotated[str, typer.Option(help="which agent")] = "sceneccn", weights: WeightsFolder = None,
+        config: ConfigFile = None, values: Values = None,
+        plain: Annotated[bool, typer.Option("--plain", help="lines instead of the live display")] = False) -> None:
+    """Run the agent and log everything: run.mcap, config.json, picture.png."""
+    from deploy.run import run as run_agent
+
+    given = {"scene.objects": objects, "scene.names": split_names(names), "scene.file": scenes, "scene.scene": scene,
+             "seed": seed, "scene.count": count, "scene.n_objects": n_objects, "scene.yaw": yaw,
+             "scene.goal_image": goal, "scene.explore": explore or None, "bus.kind": bus,
+             "perception.weights": weights}
+    run_agent(configured(config, given, values), agent=agent, out=out, plain=plain)
+
+
+@app.command()
+def bench(*, objects: Objects = None, scenes: ScenesFile = None,
+          agent: Annotated[str, typer.Option(help="which agent")] = "sceneccn",
+          limit: Annotated[int | None, typer.Option(min=1, help="only so many scenes, evenly chosen")] = None,
+          jobs: Annotated[int, typer.Option(min=1, help="processes at a time")] = 1,
+          json: Annotated[Path | None, typer.Option(
+              help="file for the results [default: bench/<agent>_<set>.json]")] = None,
+          yaw: Annotated[Literal["random", "fixed"] | None, typer.Option(
+              help="draw the scenes instead of reading them, objects turned or not")] = None,
+          seed: Seed = None, weights: WeightsFolder = None, config: ConfigFile = None, values: Values = None) -> None:
+    """Measure an agent on many scenes; given again after an interruption, go on from there."""
+    from rich.console import Console
+
+    from deploy.bench import bench as run_bench
+    from deploy.bench import prepare
+
+    resolved = configured(config, {"scene.objects": objects, "scene.file": scenes, "seed": seed,
+                                   "perception.weights": weights}, values)
+    if resolved.scene.file is not None and yaw is not None:
+        raise SaccadeError("--yaw is for scenes that are drawn: leave it or --scenes out")
+    plan = prepare(agent, resolved, json or Path("bench") / f"{agent}_{resolved.scene.objects}.json", limit=limit,
+                   yaw=yaw)
+    run_bench(plan, jobs=jobs, command=command_line(), console=wide(Console()))
+
+
+@app.command()
+def train(*, objects: Objects = None, names: Names = None,
+          out: Annotated[Path | None, typer.Option(
+              help="folder of the training [default: training_runs/<set>]")] = None,
+          steps_ccn: Annotated[int | None, typer.Option(min=1, help="steps of each object's networks")] = None,
+          steps_extraction: Annotated[int | None, typer.Option(min=1, help="steps of the network for all")] = None,
+          views: Annotated[int | None, typer.Option(min=20, max=5000, help="views of each object")] = None,
+          seed: Seed = None, jobs: Annotated[int, typer.Option(min=1, help="networks at a time")] = 1,
+          device: Annotated[Literal["auto", "cpu", "cuda"] | None, typer.Option(help="[default: auto]")] = None,
+          weights: WeightsFolder = None) -> None:
+    """Train the networks of an object set; given again after an interruption, go on from there."""
+    from rich.console import Console
+
+    from services.simulator.core import names_in_use
+    from shared.config import REPOSITORY, SceneConfig
+    from training.run import export
+    from training.run import train as run_training
+    from training.settings import TrainingConfig
+
+    object_set = objects or "pantry"
+    given = {"seed": seed, "steps_ccn": steps_ccn, "steps_extraction": steps_extraction, "views": views,
+             "device": device}
+    chosen = names_in_use(SceneConfig(objects=object_set, names=split_names(names)))
+    settings = TrainingConfig(objects=object_set, names=chosen, **{k: v for k, v in given.items() if v is not None})
+    folder, target = out or Path("training_runs") / object_set, weights or REPOSITORY / "weights" / object_set
+    run_training(folder, settings, jobs=jobs, console=Console())
+    export(folder, target)
+    print(f"weights written to {target}")
+
+
+@app.command()
+def doctor() -> None:
+    """Check this machine: what works, what is missing, how to mend it."""
+    from deploy.doctor import examine
+
+    raise typer.Exit(examine())
+
+
+@app.command()
+def topics(world: Annotated[str, typer.Option(help="world, the second part of every key")] = "table") -> None:
+    """List what is on the bus: topics, keys, message types."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from shared.topics import TOPICS
+
+    table = Table()
+    for header in ("topic", "key", "message", "how often", "what it is"):
+        table.add_column(header, no_wrap=header != "what it is")
+    for topic in TOPICS.values():
+        often = "once an episode" if topic.latched else "every step" if topic.in_step else "twice a second"
+        about = (topic.type.__doc__ or "").strip().split("\n")[0]
+        key = topic.key(world, "<part>" if topic.parts else None)
+        table.add_row(topic.name, key, topic.type.__name__, often, about)
+    wide(console := Console())
+    console.print(table, markup=False)
+
+
+def configured(path: Path | None, given: dict[str, Any], values: list[str] | None) -> Any:
+    """The configuration: the file's, then the options that were given, then `--set`."""
+    from shared.config import load
+
+    options = {key: value for key, value in given.items() if value is not None}
+    return load(path).with_values(options | dict(parse_value(text) for text in values or ()))
+
+
+def parse_value(text: str) -> tuple[str, Any]:
+    """KEY=VALUE as (key, value): JSON where it is JSON, else text."""
+    from json import loads
+
+    key, equals, value = text.partition("=")
+    if not equals or not key:
+        raise SaccadeError(f"--set {text!r}: write KEY=VALUE, such as planner.step_m=0.03")
+    try:
+        return key, loads(value)
+    except ValueError:
+        return key, value
+
+
+def split_names(names: str | None) -> list[str] | None:
+    """The objects in a,b."""
+    return None if names is None else [name.strip() for name in names.split(",") if name.strip()]
+
+
+def wide(console: Any) -> Any:
+    """Room for a table where nobody looks at a terminal: in a file or a pipe."""
+    if not console.is_terminal:
+        console.width = max(console.width, 140)
+    return console
+
+
+def command_line() -> str:
+    """The command as it was given."""
+    return shlex.join(["saccade", *sys.argv[1:]])
+
+
+def main() -> None:
+    """The console script: what the user can mend is one line and exit code 2, Ctrl-C one line and 130."""
+    try:
+        app()
+    except SaccadeError as error:
+        print(f"saccade: {error}", file=sys.stderr)
+        sys.exit(EXIT_ERROR)
+    except SystemExit as error:
+        if error.code == EXIT_INTERRUPTED:
+            reason = getattr(error.__context__, "__cause__", None)
+            print(f"saccade: interrupted{f': {reason}' if str(reason or '') else ''}", file=sys.stderr)
+        raise
+
+
+if __name__ == "__main__":
+    main()

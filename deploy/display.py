@@ -1,0 +1,149 @@
+"""What a run looks like while it goes on: a live display on a terminal, or a line now and then."""
+
+from __future__ import annotations
+
+from types import TracebackType
+
+import numpy as np
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from shared.messages import Belief, Message, Plan, Result, Status, Truth
+from shared.topics import BELIEF, PLAN, RESULT, STATUS, TRUTH, Topic
+
+LINE_EVERY = 10  # steps, in plain mode
+PER_SECOND = 8
+
+
+class Progress:
+    """What the messages of a run have told so far."""
+
+    def __init__(self) -> None:
+        self.truth: Truth | None = None
+        self.plan: Plan | None = None
+        self.beliefs: dict[str, Belief] = {}
+        self.statuses: dict[str, Status] = {}
+        self.results: list[Result] = []
+
+    def take(self, topic: Topic, part: str | None, message: Message) -> None:
+        """Any message; those of an earlier episode are forgotten."""
+        if topic == TRUTH:
+            if self.truth is not None and message.episode != self.truth.episode:
+                self.plan, self.beliefs = None, {}
+            self.truth = message
+        elif topic == PLAN:
+            self.plan = message
+        elif topic == BELIEF:
+            self.beliefs[part] = message
+        elif topic == STATUS:
+            self.statuses[part] = message
+        elif topic == RESULT:
+            self.results.append(message)
+
+    @property
+    def distance_m(self) -> float | None:
+        """From the camera to the goal's camera, in truth."""
+        if self.truth is None:
+            return None
+        return float(np.linalg.norm((self.truth.world_from_camera - self.truth.goal_world_from_camera)[:3, 3]))
+
+    @property
+    def believed_distance_m(self) -> float | None:
+        """The same as the agent believes; None while it has no idea."""
+        if self.plan is None or self.plan.believed_distance_m < 0:
+            return None
+        return self.plan.believed_distance_m
+
+
+def spread_cm(belief: Belief) -> float:
+    """Standard deviation of a believed position, over all axes."""
+    return 100 * float(np.sqrt(max(np.trace(belief.covariance_m2), 0.0)))
+
+
+def line(progress: Progress) -> str:
+    """The state of a run in one line."""
+    truth, plan = progress.truth, progress.plan
+    if truth is None:
+        return "starting"
+    parts = [f"episode {truth.episode} step {truth.step}", f"goal {_metres(progress.distance_m)} away"]
+    if plan is not None:
+        parts[-1] += f", as believed {_metres(progress.believed_distance_m)}"
+        parts.append(f"{plan.mode} {plan.target}".strip())
+        parts.append(f"G {plan.g:.1f}")
+    parts += [f"{name} ±{spread_cm(belief):.1f} cm" for name, belief in sorted(progress.beliefs.items())
+              if belief.presence > 0.5]
+    return "  ".join(parts)
+
+
+def panel(progress: Progress) -> RenderableType:
+    """The state of a run for the live display."""
+    truth = progress.truth
+    if truth is None:
+        waiting = sorted(f"{name} {status.state}" for name, status in progress.statuses.items())
+        return Text("starting: " + ", ".join(waiting or ["services"]))
+    head = Text(f"episode {truth.episode}  step {truth.step}  scene {truth.scene}", style="bold")
+    return Group(head, _plan_table(progress), _belief_table(progress), _status_line(progress))
+
+
+def _plan_table(progress: Progress) -> Table:
+    table = Table(show_header=False, box=None, padding=(0, 2))
+    table.add_row("distance to the goal", f"{_metres(progress.distance_m)} in truth",
+                  f"{_metres(progress.believed_distance_m)} as believed")
+    if (plan := progress.plan) is not None:
+        x, y, z = plan.viewpoint[:3, 3]
+        table.add_row("viewpoint", f"({x:.2f}, {y:.2f}, {z:.2f}) m", f"{plan.mode} {plan.target}".strip())
+        table.add_row("G", f"{plan.g:.2f} nats", f"position {plan.g_position:.2f}  scale {plan.g_scale:.2f}  "
+                      f"pose {plan.g_pose:.2f}  information {plan.g_information:.2f}")
+    return table
+
+
+def _belief_table(progress: Progress) -> RenderableType:
+    if not progress.beliefs:
+        return Text("")
+    table = Table(box=None, padding=(0, 2))
+    for header in ("object", "present", "where (m)", "± cm", "views"):
+        table.add_column(header, justify="left" if header == "object" else "right")
+    for name, belief in sorted(progress.beliefs.items()):
+        x, y, z = belief.mean_m
+        table.add_row(name, f"{belief.presence:.2f}", f"{x:.2f}, {y:.2f}, {z:.2f}", f"{spread_cm(belief):.1f}",
+                      str(belief.views), style="" if belief.presence > 0.5 else "dim")
+    return table
+
+
+def _status_line(progress: Progress) -> Text:
+    busy = [f"{name} {status.milliseconds:.0f} ms" for name, status in sorted(progress.statuses.items())
+            if status.milliseconds > 0]
+    notes = [f"{name}: {status.note}" for name, status in sorted(progress.statuses.items())
+             if status.refused or status.state in ("failed", "not recording")]
+    return Text("  ".join(busy) + "".join(f"\n{note}" for note in notes), style="dim")
+
+
+def _metres(distance_m: float | None) -> str:
+    return "unknown" if distance_m is None else f"{distance_m:.2f} m"
+
+
+class Display:
+    """Shows a run's messages on a console; a context manager. Plain where asked for and where nobody sits before it."""
+
+    def __init__(self, console: Console, *, plain: bool) -> None:
+        self.progress, self.console = Progress(), console
+        self.plain = plain or not console.is_terminal
+        self._live = Live(get_renderable=lambda: panel(self.progress), console=console, transient=True,
+                          refresh_per_second=PER_SECOND)
+
+    def __enter__(self) -> Display:
+        if not self.plain:
+            self._live.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        if not self.plain:
+            self._live.stop()
+
+    def take(self, topic: Topic, part: str | None, message: Message) -> None:
+        """To be called with every message of the run."""
+        self.progress.take(topic, part, message)
+        if self.plain and topic == TRUTH and message.step % LINE_EVERY == 0:
+            self.console.print(line(self.progress), markup=False, highlight=False, soft_wrap=True)

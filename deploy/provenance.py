@@ -1,0 +1,45 @@
+"""Where results come from: the code's state, the machine, paths that mean something elsewhere too."""
+
+from __future__ import annotations
+
+import os
+import platform
+import subprocess
+from importlib import metadata
+from pathlib import Path
+
+from services.simulator.opengl import choose_backend
+from shared.config import REPOSITORY
+
+PACKAGES = ("numpy", "torch", "mujoco")
+
+
+def commit() -> str:
+    """The commit of the source, with "-dirty" where it was changed since; "unknown" outside a checkout."""
+    try:
+        found = subprocess.run(["git", "-C", str(REPOSITORY), "describe", "--always", "--dirty"], capture_output=True,
+                               text=True, timeout=10, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return "unknown"
+    return found.stdout.strip()
+
+
+def machine() -> dict[str, str | int]:
+    """What may change the last bits of a result, and its seconds."""
+    return {"processor": _processor(), "cores": os.cpu_count() or 1, "system": platform.system(),
+            "python": platform.python_version(), "opengl": choose_backend(),
+            **{name: metadata.version(name) for name in PACKAGES}}
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()
+
+
+def shown(path: Path) -> str:
+    """A path relative to the repository where it is inside, else its name alone."""
+    resolved = path.resolve()
+    return str(resolved.relative_to(REPOSITORY)) if resolved.is_relative_to(REPOSITORY) else resolved.name

@@ -1,0 +1,81 @@
+"""Which cores make an agent, by name; the processes of a run and the pairs of an in-process run derive from it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib import import_module
+
+from deploy.launch import PROCESSES, Process
+from shared.config import Config
+from shared.errors import SaccadeError
+from shared.service import Core, Service
+
+Pair = tuple[Service, Core]
+
+SOURCE, JUDGE, RECORDER = "simulator", "evaluator", "recorder"
+
+
+@dataclass(frozen=True)
+class Agent:
+    """`services` are processes of their own in deploy/launch.py; `cores` are modules that only run within one process."""
+
+    services: tuple[str, ...] = ()
+    cores: tuple[str, ...] = ()
+    weights: bool = True  # whether it needs trained ones
+
+    @property
+    def modules(self) -> tuple[str, ...]:
+        """The modules that hold SERVICE and build, in the order of the data."""
+        return tuple(f"services.{name}.core" for name in self.services) + self.cores
+
+
+AGENTS = {
+    "sceneccn": Agent(services=("perception", "belief", "planner")),
+    "oracle": Agent(cores=("services.planner.oracle",), weights=False),
+}
+
+
+def agent_of(name: str) -> Agent:
+    """The agent of that name; raises SaccadeError for an unknown one."""
+    if name not in AGENTS:
+        raise SaccadeError(f"agent {name!r} is unknown: choose from {', '.join(AGENTS)}")
+    return AGENTS[name]
+
+
+def agent_pairs(agent: str, config: Config) -> list[Pair]:
+    """Declarations and cores of an agent, built for a configuration whose objects are named."""
+    return [_pair(module, config) for module in agent_of(agent).modules]
+
+
+def local_pairs(agent: str, config: Config) -> list[Pair]:
+    """Everything that an in-process run needs: the simulator, the agent, the evaluator."""
+    world, judge = (_pair(f"services.{name}.core", config) for name in (SOURCE, JUDGE))
+    return [world, *agent_pairs(agent, config), judge]
+
+
+def agent_processes(agent: str) -> tuple[Process, ...]:
+    """The processes of a run on the bus. Raises SaccadeError for an agent that has none of its own."""
+    chosen = agent_of(agent)
+    if chosen.cores:
+        raise SaccadeError(f"agent {agent!r} runs within one process only: add `--bus local`")
+    wanted = {SOURCE, *chosen.services, JUDGE, RECORDER}
+    return tuple(process for process in PROCESSES if process.name in wanted)
+
+
+def weight_hashes(agent: str, config: Config) -> dict[str, str]:
+    """Hashes of the weights that an agent works with, by file; none for one that needs none.
+
+    Raises SaccadeError where they are missing, damaged or lack one of the run's objects.
+    """
+    if not agent_of(agent).weights:
+        return {}
+    from shared.weights import Weights  # loads torch
+
+    weights = Weights(config.weights)
+    weights.cards_of(config.scene.names or ())
+    return dict(sorted(weights.hashes.items()))
+
+
+def _pair(module_name: str, config: Config) -> Pair:
+    module = import_module(module_name)
+    return module.SERVICE, module.build(config)

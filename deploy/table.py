@@ -1,0 +1,127 @@
+"""The benchmark's table: what the paper reports (section 4.2), ours beside it. Pure functions of the results."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from statistics import fmean, median, stdev
+from typing import Any
+
+from rich.table import Table
+
+Record = Mapping[str, Any]
+
+Z_95 = 1.959963984540054  # of the standard normal distribution
+MEASURES = {"azimuth_error_rad": "azimuth (rad)", "elevation_error_rad": "elevation (rad)",
+            "range_error_m": "range (m)"}
+TOTAL = "Total"
+
+
+@dataclass(frozen=True)
+class Figures:
+    """One row of the paper's table, SceneCCN + AIF: success in percent, mean errors in the order of MEASURES."""
+
+    success_percent: float
+    means: tuple[float, float, float]
+    errors: tuple[float, float, float] | None = None  # standard errors, where the paper gives them
+
+
+PAPER = {
+    "002_master_chef_can": Figures(84.0, (0.491, 0.138, 0.042)),
+    "003_cracker_box": Figures(66.0, (0.532, 0.290, 0.058)),
+    "004_sugar_box": Figures(69.0, (0.508, 0.232, 0.058)),
+    "005_tomato_soup_can": Figures(46.0, (0.896, 0.220, 0.120)),
+    "006_mustard_bottle": Figures(80.0, (0.420, 0.275, 0.057)),
+    TOTAL: Figures(69.0, (0.569, 0.231, 0.067), (0.034, 0.014, 0.004)),
+}
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A value with its 95 % interval; for means also the standard error (None for fewer than two samples)."""
+
+    value: float
+    low: float
+    high: float
+    standard_error: float | None = None
+
+
+@dataclass(frozen=True)
+class Row:
+    """What one target (or all of them) came to. Shares are fractions; `declared_true` is of those that declared."""
+
+    name: str
+    scenes: int
+    success: Estimate
+    means: tuple[Estimate, ...]  # in the order of MEASURES
+    median_steps: float
+    declared: float
+    declared_true: float | None
+
+
+def wilson(successes: int, trials: int) -> Estimate:
+    """Share of successes with Wilson's score interval. Raises ValueError without trials."""
+    if not 0 <= successes <= trials or trials == 0:
+        raise ValueError(f"{successes} successes of {trials} trials")
+    share, square = successes / trials, Z_95 ** 2
+    centre = (share + square / (2 * trials)) / (1 + square / trials)
+    half = Z_95 / (1 + square / trials) * math.sqrt(share * (1 - share) / trials + square / (4 * trials ** 2))
+    return Estimate(share, max(0.0, centre - half), min(1.0, centre + half))
+
+
+def mean(values: Sequence[float]) -> Estimate:
+    """Mean with its standard error and the normal interval; of a single value no more than the value is known."""
+    value = fmean(values)
+    if len(values) < 2:
+        return Estimate(value, math.nan, math.nan)
+    error = stdev(values) / math.sqrt(len(values))
+    return Estimate(value, value - Z_95 * error, value + Z_95 * error, error)
+
+
+def summarise(name: str, records: Sequence[Record]) -> Row:
+    """The row of some results (at least one)."""
+    declared = [r for r in records if r["declared"]]
+    return Row(name, len(records), wilson(sum(r["success"] for r in records), len(records)),
+               tuple(mean([r[key] for r in records]) for key in MEASURES), median(r["steps"] for r in records),
+               len(declared) / len(records),
+               sum(r["declared_true"] for r in declared) / len(declared) if declared else None)
+
+
+def rows(records: Sequence[Record]) -> list[Row]:
+    """One row per target, in the order of their first scene, and the total."""
+    targets = dict.fromkeys(r["target"] for r in records)
+    parts = [summarise(name, [r for r in records if r["target"] == name]) for name in targets]
+    return [*parts, summarise(TOTAL, records)]
+
+
+def render(records: Sequence[Record], *, title: str) -> Table:
+    """The table for the terminal: three lines a target, ours, its 95 % interval, and the paper's where it has one."""
+    theirs = "paper" if any(r["target"] in PAPER for r in records) else "paper (YCB)"
+    caption = "± is the standard error of the mean; 95 % intervals: Wilson for success, normal for means"
+    table = Table(title=title, caption=caption, show_lines=True)
+    for header in ("target", "", "n"):
+        table.add_column(header)
+    for header in ("success (%)", *MEASURES.values(), "median steps", "declared", "rightly"):
+        table.add_column(header, justify="right")
+    for row in rows(records):
+        paper = PAPER.get(row.name)
+        labels = "\n".join(["ours", "95 %", *([theirs] if paper else [])])
+        rightly = "-" if row.declared_true is None else f"{100 * row.declared_true:.0f} %"
+        table.add_row(row.name, labels, str(row.scenes), *_cells(row, paper), f"{row.median_steps:g}",
+                      f"{100 * row.declared:.0f} %", rightly, style="bold" if row.name == TOTAL else "")
+    return table
+
+
+def _cells(row: Row, paper: Figures | None) -> list[str]:
+    share = row.success
+    cells = [[f"{100 * share.value:.1f}", f"{100 * share.low:.1f} – {100 * share.high:.1f}"]]
+    for estimate in row.means:
+        known = estimate.standard_error is not None
+        cells.append([f"{estimate.value:.3f}" + (f" ± {estimate.standard_error:.3f}" if known else ""),
+                      f"{estimate.low:.3f} – {estimate.high:.3f}" if known else "-"])
+    if paper is not None:
+        cells[0].append(f"{paper.success_percent:.1f}")
+        for i, value in enumerate(paper.means):
+            cells[i + 1].append(f"{value:.3f}" + (f" ± {paper.errors[i]:.3f}" if paper.errors else ""))
+    return ["\n".join(cell) for cell in cells]

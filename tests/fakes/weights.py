@@ -1,0 +1,25 @@
+"""Weights that have learnt nothing, in the layout of trained ones."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from services.perception.networks import Extraction, Identity
+from services.simulator.objects import load_mesh
+from services.simulator.views import crop_side_m
+from shared.generative_model import CCN
+from shared.weights import ObjectCard, write_weights
+
+
+def write_random_weights(folder: Path, object_set: str, names: tuple[str, ...]) -> None:
+    """The same weights at every call with these objects."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(1)
+        states = {"extraction": Extraction(len(names)).state_dict()}
+        for name in names:
+            states[name] = torch.nn.ModuleDict({"ccn": CCN(), "identity": Identity()}).state_dict()
+    sizes = [load_mesh(object_set, name).size_m for name in names]
+    cards = tuple(ObjectCard(name, size, crop_side_m(size)) for name, size in zip(names, sizes, strict=True))
+    write_weights(folder, states, cards, {"data": "none: random"})

@@ -1,0 +1,146 @@
+"""A run as real processes: the log equals the in-process run to the byte, and whatever ends a run leaves no process."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections import defaultdict
+from pathlib import Path
+
+import pytest
+
+from deploy.launch import PROCESSES, launch
+from shared.bus import ZenohBus, free_endpoint
+from shared.config import load
+from shared.errors import SaccadeError
+from shared.loop import run_local
+from shared.messages import Status
+from shared.recording import RunReader, missing
+from shared.topics import FRAME, RESULT, STATUS
+from tests.fakes.launch import FAKES, PARTS, configuration
+from tests.fakes.services import pairs
+
+WAIT_S = 60
+
+
+def of_run(run_dir: Path) -> list[int]:
+    """Process ids of services that run on this folder's configuration."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            if f"{run_dir}/config.json".encode() in path.read_bytes():
+                found.append(int(path.parent.name))
+        except OSError:
+            continue
+    return found
+
+
+def until(condition) -> bool:
+    """Waits for what must come to pass; nothing is asserted about how long it takes."""
+    end = time.monotonic() + WAIT_S
+    while not condition() and time.monotonic() < end:
+        time.sleep(0.05)
+    return condition()
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    run_dir = tmp_path_factory.mktemp("launch") / "run"
+    seen = []
+    results = launch(configuration(3, 8), run_dir, lambda *item: seen.append(item), FAKES)
+    return run_dir, results, seen
+
+
+def test_the_log_equals_the_run_in_one_process(run):
+    run_dir, results, _ = run
+    expected, logged = defaultdict(list), defaultdict(list)
+    run_local(pairs(load(run_dir / "config.json")), PARTS, run_dir.name, None,
+              lambda t, p, m, payload: expected[t.name, p].append(payload), encoded=True)
+    for entry in RunReader(run_dir / "run.mcap").entries():
+        if entry.topic != STATUS:
+            logged[entry.topic.name, entry.part].append(entry.payload)
+    assert logged == expected
+    assert [(r.episode, r.steps) for r in results] == [(0, 8), (1, 8), (2, 8)]
+
+
+def test_the_log_is_whole_and_says_where_it_comes_from(run):
+    run_dir, _, _ = run
+    report = missing(run_dir / "run.mcap")
+    assert report.complete, report
+    reader = RunReader(run_dir / "run.mcap")
+    services = {p for t, p, _ in reader if t == STATUS}
+    assert services == {process.name for process in PROCESSES}
+    assert reader.metadata["run"]["seed"] == "5"
+    assert re.fullmatch("[0-9a-f]{64}", reader.metadata["run"]["configuration_sha256"])
+    assert reader.configuration.strip() == (run_dir / "config.json").read_text().strip()
+
+
+def test_the_caller_sees_every_message(run):
+    run_dir, _, seen = run
+    frames = [m for t, _, m in seen if t == FRAME]
+    assert [(m.episode, m.step) for m in frames] == [(e, s) for e in range(3) for s in range(8)]
+    assert sum(t == RESULT for t, _, _ in seen) == 3
+    last = {p: m for t, p, m in seen if t == STATUS and isinstance(m, Status)}
+    assert {name: s.state for name, s in last.items()} == {process.name: "stopped" for process in PROCESSES}
+    assert all((s.refused, s.gaps, s.skipped) == (0, 0, 0) for s in last.values())
+    assert of_run(run_dir) == []
+
+
+@pytest.mark.parametrize(("wish", "message"), [
+    ("planner breaks", "planner: the fake planner has had enough: give it a break"),
+    ("planner dies", "planner: it said nothing .*SIGKILL"),
+    ("belief breaks at start", "belief: weights are missing: fetch them")])
+def test_a_service_that_ends_is_named_with_its_reason(tmp_path, wish, message):
+    with pytest.raises(SaccadeError, match=message):
+        launch(configuration(3, 8, wish), tmp_path / "run", None, FAKES)
+    assert of_run(tmp_path / "run") == []
+    assert not missing(tmp_path / "run" / "run.mcap").cut
+
+
+def test_a_port_in_use_starts_nothing(tmp_path):
+    endpoint = free_endpoint("tcp/127.0.0.1:0")
+    other = ZenohBus(endpoint, world="test", listen=True)
+    try:
+        with pytest.raises(SaccadeError, match="in use"):
+            launch(configuration(1, 1).with_values({"bus.endpoint": endpoint}), tmp_path, None, FAKES)
+    finally:
+        other.close()
+    assert of_run(tmp_path) == []
+
+
+def test_a_log_is_never_written_over(tmp_path, run):
+    run_dir, _, _ = run
+    before = (run_dir / "run.mcap").read_bytes()
+    with pytest.raises(SaccadeError, match="already holds a log"):
+        launch(configuration(1, 1), run_dir, None, FAKES)
+    assert (run_dir / "run.mcap").read_bytes() == before
+    (tmp_path / "file").write_text("")
+    with pytest.raises(SaccadeError, match="cannot be made"):
+        launch(configuration(1, 1), tmp_path / "file" / "run", None, FAKES)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL], ids=lambda s: s.name)
+def test_an_interrupted_launcher_leaves_no_process_and_a_readable_log(tmp_path, number):
+    run_dir = tmp_path / "run"
+    launcher = subprocess.Popen([sys.executable, "-m", "tests.fakes.launch", str(run_dir), "1", "1000000"],
+                                stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    try:
+        log = run_dir / "run.mcap"
+        assert until(lambda: log.exists() and any(t == FRAME for t, _, _ in RunReader(log)))
+        assert len(of_run(run_dir)) == len(PROCESSES)
+        os.kill(launcher.pid, number)
+        launcher.wait(WAIT_S)
+        assert until(lambda: of_run(run_dir) == [])
+        report = missing(log)
+        assert report.cut is None
+        assert report.lost == {}
+        assert report.messages > 0
+    finally:
+        launcher.kill()
+        launcher.stdout.close()
+        for left in of_run(run_dir):
+            os.kill(left, signal.SIGKILL)

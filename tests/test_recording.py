@@ -1,0 +1,314 @@
+"""A log gives back what was written, also when the recorder was killed, the file cut or the disk full."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+
+from shared.bus import ZenohBus, free_endpoint
+from shared.config import Config
+from shared.errors import SaccadeError
+from shared.messages import encode, field_types
+from shared.recording import RecordingStopped, RunLog, RunReader, json_schema, missing
+from shared.topics import ACTION, BELIEF, FRAME, PERCEPT, STATUS, TOPICS, TRUTH
+from tests.samples import sample
+
+WAIT_S = 60
+MOST_LOST_S = 1.0  # what a killed recorder may lose
+
+
+def write(path: Path, messages, **options) -> RunLog:
+    log = RunLog(path, world="test", **options)
+    for topic, part, message in messages:
+        log.write(topic, part, encode(message), sequence=message.seq)
+    return log
+
+
+def steps(count: int, *topics, first: int = 0) -> list:
+    return [(t, "mug" if t.parts else None, sample(t.type, run="r", episode=0, step=i, seq=i, **options(t)))
+            for i in range(first, first + count) for t in topics]
+
+
+def options(topic) -> dict:
+    return {"object": "mug"} if topic.parts and topic != STATUS else {"done": False} if topic == TRUTH else {}
+
+
+def test_every_topic_comes_back_as_it_was(tmp_path):
+    messages = steps(3, *TOPICS.values())
+    write(tmp_path / "run.mcap", messages, configuration='{"seed": 1}', metadata={"versions": {"x": "1"}}).close()
+    reader = RunReader(tmp_path / "run.mcap")
+    assert [(e.topic, e.part, e.payload) for e in reader.entries()] == [(t, p, encode(m)) for t, p, m in messages]
+    assert [(t, p, encode(m)) for t, p, m in reader] == [(t, p, encode(m)) for t, p, m in messages]
+    assert (reader.cut, reader.refused, reader.world) == (None, 0, "test")
+    assert reader.metadata == {"versions": {"x": "1"}}
+    assert json.loads(reader.configuration) == {"seed": 1}
+
+
+def test_any_mcap_tool_can_read_it(tmp_path):
+    write(tmp_path / "run.mcap", steps(5, FRAME, PERCEPT)).close()
+    with (tmp_path / "run.mcap").open("rb") as stream:
+        summary = make_reader(stream, validate_crcs=True).get_summary()
+    assert {c.topic: c.message_encoding for c in summary.channels.values()} == {
+        "saccade/test/frame": "msgpack", "saccade/test/percept/mug": "msgpack"}
+    assert {s.name: s.encoding for s in summary.schemas.values()} == {"Frame": "jsonschema", "Percept": "jsonschema"}
+    assert summary.statistics.message_count == 10
+    assert {c.compression for c in summary.chunk_indexes} == {"zstd"}
+
+
+@pytest.mark.parametrize("topic", TOPICS.values(), ids=lambda t: t.name)
+def test_schemas_name_every_field_with_dtype_and_shape(topic):
+    schema = json_schema(topic.type)
+    assert set(schema["required"]) == {"type", "version", *field_types(topic.type)}
+    assert schema["properties"]["step"] == {"type": "integer"}
+    text = json.dumps(schema)
+    assert text.count('"x-dtype"') == text.count('"x-shape"') == sum("ArraySpec" in str(h) for h in
+                                                                    field_types(topic.type).values())
+
+
+def test_entries_that_are_no_messages_are_kept_and_counted(tmp_path):
+    log = write(tmp_path / "run.mcap", steps(2, ACTION))
+    log.write(ACTION, None, b"nonsense")
+    log.close()
+    reader = RunReader(tmp_path / "run.mcap")
+    assert len(list(reader)) == 2
+    assert reader.refused == 1
+    assert [e.payload for e in reader.entries()][-1] == b"nonsense"
+
+
+def test_a_cut_file_is_read_up_to_the_cut(tmp_path):
+    messages = steps(400, FRAME)
+    log = RunLog(tmp_path / "run.mcap", world="test")
+    for i, (topic, part, message) in enumerate(messages):
+        log.write(topic, part, encode(message))
+        if i % 50 == 49:
+            log._flushed_s = -1e9  # as if FLUSH_S had passed
+            log.flush_if_due()
+    log.close()
+    whole = (tmp_path / "run.mcap").read_bytes()
+    counts = []
+    for length in range(len(whole) - 1, 9, -max(1, len(whole) // 97)):
+        (tmp_path / "cut.mcap").write_bytes(whole[:length])
+        reader = RunReader(tmp_path / "cut.mcap")
+        read = [encode(m) for _, _, m in reader]
+        assert "cut or damaged" in reader.cut
+        assert read == [encode(m) for _, _, m in messages[:len(read)]]
+        assert len(read) % 50 == 0
+        counts.append(len(read))
+    assert counts == sorted(counts, reverse=True)
+    assert counts[0] == 400
+    assert len(set(counts)) > 4
+
+
+def test_a_damaged_file_is_read_up_to_the_damage(tmp_path):
+    log = write(tmp_path / "run.mcap", steps(200, ACTION))
+    log._flushed_s = -1e9
+    log.flush_if_due()
+    size = log.path.stat().st_size
+    for topic, part, message in steps(200, BELIEF):
+        log.write(topic, part, encode(message))
+    log.close()
+    data = bytearray(log.path.read_bytes())
+    data[size + 200] ^= 0xFF
+    log.path.write_bytes(data)
+    reader = RunReader(log.path)
+    assert sum(t == ACTION for t, _, _ in reader) == 200
+    assert "cut or damaged" in reader.cut
+
+
+@pytest.mark.parametrize(("content", "message"), [(b"", "empty"), (b"hello, text", "not an MCAP"), (None, "cannot")])
+def test_what_is_no_log_is_one_clear_error(tmp_path, content, message):
+    if content is not None:
+        (tmp_path / "run.mcap").write_bytes(content)
+    with pytest.raises(SaccadeError, match=message):
+        RunReader(tmp_path / "run.mcap")
+
+
+def test_a_folder_that_cannot_be_written_is_one_clear_error(tmp_path):
+    (tmp_path / "file").write_text("")
+    for path in (tmp_path / "file" / "run.mcap", tmp_path / "file"):
+        with pytest.raises(SaccadeError, match="cannot be written"):
+            RunLog(path, world="test")
+
+
+def test_a_full_disk_stops_the_recording_once_and_keeps_what_there_is(tmp_path):
+    child = subprocess.run([sys.executable, "-c", FILL, str(tmp_path / "run.mcap")], capture_output=True, text=True)
+    assert child.returncode == 0, child.stderr
+    written = int(child.stdout)
+    reader = RunReader(tmp_path / "run.mcap")
+    read = [m.step for _, _, m in reader]
+    assert read == list(range(len(read)))
+    assert 0 < len(read) <= written
+    assert reader.cut
+    assert (tmp_path / "run.mcap").stat().st_size <= 300_000
+
+
+FILL = """
+import resource, sys, pathlib
+import numpy as np
+from shared.messages import encode
+from shared.recording import RecordingStopped, RunLog
+from shared.topics import FRAME
+from tests.samples import sample
+resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000))
+log, noise = RunLog(pathlib.Path(sys.argv[1]), world="test"), np.random.default_rng(0)
+written = stopped = 0
+for step in range(200):
+    rgb = noise.integers(0, 256, (60, 60, 3), dtype=np.uint8)
+    message = sample(FRAME.type, step=step, seq=step, rgb=rgb, depth_m=np.zeros((60, 60), np.float32))
+    try:
+        log.write(FRAME, None, encode(message))
+        log._flushed_s = -1e9
+        log.flush_if_due()
+        written += not stopped
+    except RecordingStopped as error:
+        assert "keeps what was recorded" in str(error)
+        stopped += 1
+log.close()
+assert stopped == 1
+print(written + 1)
+"""
+
+
+@pytest.fixture
+def tiny_disk(tmp_path):
+    """A file system of one megabyte; needs root."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    try:
+        subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(folder)], check=True, capture_output=True)
+    except (OSError, subprocess.CalledProcessError):
+        pytest.skip("no right to mount a small file system; the file size limit is tested instead")
+    yield folder
+    subprocess.run(["umount", str(folder)], check=True)
+
+
+def test_a_disk_that_is_really_full(tiny_disk):
+    (tiny_disk / "ballast").write_bytes(bytes(600_000))
+    log = RunLog(tiny_disk / "run.mcap", world="test")
+
+    def fill() -> None:
+        for topic, part, message in steps(2000, FRAME):
+            log.write(topic, part, encode(message) + os.urandom(2000))
+            log._flushed_s = -1e9
+            log.flush_if_due()
+
+    with pytest.raises(RecordingStopped, match="No space left"):
+        fill()
+    log.close()
+    reader = RunReader(tiny_disk / "run.mcap")
+    assert len(list(reader.entries())) > 50
+    assert "No space left" in reader.cut
+
+
+class RecorderProcess:
+    """The real recorder on a bus, and a publisher beside it."""
+
+    def __init__(self, folder: Path, limit_bytes: int | None = None) -> None:
+        endpoint = free_endpoint("tcp/127.0.0.1:0")
+        self.bus = ZenohBus(endpoint, world="test", listen=True)
+        self.said: list = []
+        self.bus.subscribe([STATUS], lambda _topic, _part, payload: self.said.append(payload))
+        folder.mkdir(exist_ok=True)
+        Config().with_values({"bus.endpoint": endpoint, "bus.world": "test"}).save(folder / "config.json")
+        limit = (lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit_bytes,) * 2)) if limit_bytes else None
+        self.process = subprocess.Popen([sys.executable, "-m", "services.recorder", "--config", folder / "config.json"],
+                                        stderr=subprocess.PIPE, text=True, preexec_fn=limit)
+        self.until(lambda: b"ready" in b"".join(self.said))
+
+    def until(self, condition) -> None:
+        end = time.monotonic() + WAIT_S
+        while not condition():
+            assert time.monotonic() < end, "it did not come"
+            time.sleep(0.01)
+
+    def close(self) -> None:
+        self.process.kill()
+        self.process.communicate()
+        self.bus.close()
+
+
+def test_a_killed_recorder_loses_at_most_a_second(tmp_path):
+    """Each message carries the time at which it was sent: all those older than a second at the kill must be there."""
+    sent_s = {}
+    with closing(RecorderProcess(tmp_path / "run")) as recorder:
+        start = time.monotonic()
+        while (now := time.monotonic()) - start < 3.5:
+            step = len(sent_s)
+            sent_s[step] = now
+            message = sample(PERCEPT.type, object="mug", step=step, scale=now, seq=step)
+            recorder.bus.publish(PERCEPT, "mug", encode(message))
+            time.sleep(0.005)
+        killed_s = time.monotonic()
+        recorder.process.send_signal(signal.SIGKILL)
+        recorder.process.wait(WAIT_S)
+        reader = RunReader(tmp_path / "run" / "run.mcap")
+        recorded = {m.step: m.scale for t, _, m in reader if t == PERCEPT}
+    assert reader.cut is not None
+    assert all(recorded[step] == sent_s[step] for step in recorded)
+    owed = [step for step, at_s in sent_s.items() if at_s < killed_s - MOST_LOST_S]
+    assert len(owed) > 100
+    assert set(owed) <= set(recorded), f"lost {len(set(owed) - set(recorded))} of {len(owed)}"
+
+
+def test_the_recorder_finishes_its_file_and_tells_gaps(tmp_path):
+    with closing(RecorderProcess(tmp_path / "run")) as recorder:
+        for seq in (0, 1, 2, 5, 6):
+            recorder.bus.publish(ACTION, None, encode(sample(ACTION.type, step=seq, seq=seq)))
+        recorder.until(lambda: b"2 lost before action 5" in b"".join(recorder.said))
+        recorder.process.terminate()
+        _, error = recorder.process.communicate(timeout=WAIT_S)
+    assert recorder.process.returncode == 0
+    assert "lacks 2 messages" in error
+    report = missing(tmp_path / "run" / "run.mcap")
+    assert report.cut is None
+    assert report.lost == {"saccade/test/action": 2}
+
+
+def test_a_recorder_without_room_says_so_and_the_bus_goes_on(tmp_path):
+    with closing(RecorderProcess(tmp_path / "run", limit_bytes=600_000)) as recorder:
+        step = 0
+        while b"not recording" not in b"".join(recorder.said):
+            payload = encode(sample(ACTION.type, step=step, seq=step)) + os.urandom(3000)
+            recorder.bus.publish(ACTION, None, payload)
+            step += 1
+            time.sleep(0.01)
+            assert step < 20_000
+        assert recorder.process.poll() is None
+        recorder.process.terminate()
+        _, error = recorder.process.communicate(timeout=WAIT_S)
+    assert recorder.process.returncode == 2
+    assert error.startswith("saccade: recording stopped (")
+    assert error.count("\n") == 1
+    reader = RunReader(tmp_path / "run" / "run.mcap")
+    assert sum(e.topic == ACTION for e in reader.entries()) > 10
+
+
+def test_the_recorder_loads_neither_torch_nor_mujoco():
+    code = "import sys, services.recorder.core; print({'torch', 'mujoco', 'scipy'} & set(sys.modules))"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "set()\n"
+
+
+def test_missing_steps_and_topics_are_reported(tmp_path):
+    messages = [entry for entry in steps(4, FRAME, PERCEPT, ACTION, TRUTH)
+                if (entry[0], entry[2].step) not in ((ACTION, 1), (PERCEPT, 2))]
+    messages.append((TRUTH, None, sample(TRUTH.type, run="r", episode=0, step=4, seq=4, done=True)))
+    write(tmp_path / "run.mcap", messages).close()
+    report = missing(tmp_path / "run.mcap")
+    assert report.absent == [("r", 0, 1, "saccade/test/action"), ("r", 0, 2, "saccade/test/percept/mug")]
+    assert report.lost == {"saccade/test/action": 1, "saccade/test/percept/mug": 1}
+    assert not report.complete
+    write(tmp_path / "late.mcap", steps(3, FRAME, first=2)).close()
+    assert missing(tmp_path / "late.mcap").lost == {"saccade/test/frame": 2}
+    assert [at[2] for at in missing(tmp_path / "late.mcap").absent] == [0, 1]
+    write(tmp_path / "good.mcap", steps(4, FRAME, PERCEPT, ACTION, TRUTH)).close()
+    assert missing(tmp_path / "good.mcap").complete
