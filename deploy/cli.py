@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import signal
 import sys
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -180,6 +181,7 @@ def main() -> None:
         sys.exit(EXIT_ERROR)
     except SystemExit as error:
         if error.code == EXIT_INTERRUPTED:
+            signal.signal(signal.SIGINT, signal.SIG_IGN)  # once more would break into the interpreter's end
             reason = getattr(error.__context__, "__cause__", None)
             print(f"saccade: interrupted{f': {reason}' if str(reason or '') else ''}", file=sys.stderr)
         raise

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -29,7 +30,9 @@ class Story:
 
     episode: int
     goal_rgb: NDArray[np.uint8] | None = None
+    goal_is_known: bool = False  # that its view is the truth's, not that of an image from elsewhere
     last_rgb: NDArray[np.uint8] | None = None
+    last_step: int = 0  # of `last_rgb`: the last move has no view of its own
     path_m: list[NDArray[np.float64]] = field(default_factory=list)
     beliefs: dict[str, Belief] = field(default_factory=dict)
     truth: Truth | None = None
@@ -40,7 +43,8 @@ class Story:
 def read_story(log: Path, episode: int | None = None) -> Story:
     """The last episode of a log, or the one that is asked for. Raises SaccadeError if the log has no frame of it."""
     story, ways = Story(-1 if episode is None else episode), {}
-    for topic, part, message in RunReader(log):
+    reader = RunReader(log)
+    for topic, part, message in reader:
         if topic not in (GOAL, FRAME, BELIEF, TRUTH, PLAN, RESULT):
             continue
         if episode is None and message.episode > story.episode:
@@ -50,7 +54,7 @@ def read_story(log: Path, episode: int | None = None) -> Story:
         if topic == GOAL:
             story.goal_rgb = message.rgb
         elif topic == FRAME:
-            story.last_rgb = message.rgb
+            story.last_rgb, story.last_step = message.rgb, message.step
         elif topic == BELIEF:
             story.beliefs[part] = message
         elif topic == TRUTH:
@@ -65,7 +69,13 @@ def read_story(log: Path, episode: int | None = None) -> Story:
         which = "no episode" if episode is None else f"nothing of episode {episode}"
         raise SaccadeError(f"log {log} has {which} in it: draw a log that holds frames")
     story.path_m = [ways[step] for step in sorted(ways)]
+    story.goal_is_known = story.truth is not None and story.goal_rgb is not None and not _goal_from_elsewhere(reader)
     return story
+
+
+def _goal_from_elsewhere(reader: RunReader) -> bool:
+    scene = json.loads(reader.configuration or "{}").get("scene", {})
+    return scene.get("goal_image") is not None
 
 
 def draw(log: Path, out: Path, episode: int | None = None) -> Story:
@@ -75,7 +85,7 @@ def draw(log: Path, out: Path, episode: int | None = None) -> Story:
     FigureCanvasAgg(figure)
     goal, view, above = figure.subplots(1, 3)
     _image(goal, story.goal_rgb, "goal" if story.goal_rgb is not None else "no goal: exploring")
-    _image(view, story.last_rgb, "last view")
+    _image(view, story.last_rgb, f"last view (step {story.last_step})")
     _from_above(above, story)
     figure.suptitle(_title(story))
     try:
@@ -103,7 +113,7 @@ def _from_above(axes: Axes, story: Story) -> None:
     if story.truth is not None:
         axes.plot(*story.truth.centers_m[:, :2].T, "o", color="black", fillstyle="none", markersize=13,
                   label="true position", linestyle="none", zorder=4)
-        if story.goal_rgb is not None and (story.result is None or story.truth.target):
+        if story.goal_is_known:
             axes.plot(*story.truth.goal_world_from_camera[:2, 3], "*", color="black", markersize=13, label="goal's view",
                       linestyle="none", zorder=4)
     path = np.array(story.path_m)

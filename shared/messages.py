@@ -147,7 +147,7 @@ class Action(Message):
 class Truth(Message):
     """The simulator's ground truth, for evaluator, viewer and oracle only. `done`: no further frame will come.
 
-    `keep_out_m`: radii of the spheres around the objects that the camera cannot enter. The target's centre is also that
+    `keep_out_m`: radii of the spheres around the objects that the camera is pushed out of, in their order. The target's centre is also that
     of its place in the goal image where it does not stand on the table. `step` counts the actions taken.
     """
 

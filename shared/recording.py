@@ -40,7 +40,7 @@ class RecordingStopped(SaccadeError):
 class RunLog:
     """Writes one run's log. `metadata`: names to maps of text, such as versions and weights' hashes.
 
-    Raises SaccadeError if the file cannot be created or is there already, RecordingStopped when it can take no more, once.
+    Raises SaccadeError if the file cannot be created or is there already; RecordingStopped, once, when it is full.
     """
 
     def __init__(self, path: Path, *, world: str, configuration: str = "{}",

@@ -26,7 +26,7 @@ TOLERANCE_M = 1e-9
 
 @dataclass(frozen=True)
 class Spheres:
-    """Where the camera may not be: centres [N, 3] and radii [N], metres."""
+    """What `clip` pushes the camera out of: centres [N, 3] and radii [N], metres."""
 
     centers_m: Array
     radii_m: Array
@@ -50,23 +50,18 @@ def start_pose() -> Array:
 
 
 def clip(position: ArrayLike, spheres: Spheres) -> Array:
-    """The position [3] that stands for `position`: pushed radially out of each sphere in turn, then into the workspace.
+    """What stands for each position [..., 3]: pushed radially out of one sphere after another, then into the workspace.
 
     One pass, as in the benchmark: its published goals are clipped so, and a few lie inside a sphere because a later
-    sphere or the workspace moved them there. An agent under a stricter rule could not get to all of them.
+    sphere moved them there. Under a stricter rule no agent could get to all of them.
     """
     result = np.asarray(position, dtype=np.float64)
     for center, radius in zip(spheres.centers_m, spheres.radii_m, strict=True):
-        result = _push_out(result, center, radius)
+        offset = result - center
+        distance = np.linalg.norm(offset, axis=-1, keepdims=True)
+        away = np.where(distance > TOLERANCE_M, offset / np.maximum(distance, TOLERANCE_M), (0.0, 0.0, 1.0))
+        result = np.where(distance < radius, center + radius * away, result)
     return np.clip(result, LOWER_M, UPPER_M)
-
-
-def _push_out(position: Array, center: Array, radius: float) -> Array:
-    offset = position - center
-    distance = np.linalg.norm(offset)
-    if distance >= radius:
-        return position
-    return center + radius * (offset / distance if distance > TOLERANCE_M else np.array([0.0, 0.0, 1.0]))
 
 
 def apply_action(world_from_camera: ArrayLike, translation_m: ArrayLike, rotation_rad: ArrayLike) -> Array:

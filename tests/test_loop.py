@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import queue
 import threading
@@ -17,11 +16,10 @@ from shared.bus import LocalBus, ZenohBus, free_endpoint
 from shared.config import Config
 from shared.errors import SaccadeError
 from shared.loop import main, run_local, serve
-from shared.messages import MAX_BYTES, MessageError, Status, decode, encode
+from shared.messages import MAX_BYTES, Status, decode, encode
 from shared.process import Inbox
 from shared.service import Output, Service
-from shared.stepper import GapCounter, Stepper, settle
-from shared.topics import ACTION, BELIEF, FRAME, GOAL, GOAL_PERCEPT, PERCEPT, PLAN, RESULT, STATUS, TOPICS, TRUTH
+from shared.topics import ACTION, BELIEF, FRAME, GOAL_PERCEPT, PERCEPT, PLAN, RESULT, STATUS, TOPICS, TRUTH
 from tests.fakes.services import SERVICES, FakePlanner, pairs
 from tests.samples import array_fields, sample
 
@@ -190,106 +188,6 @@ def test_a_service_says_what_it_waits_for_and_goes_on_when_it_comes(monkeypatch)
         running.until_status("planner", lambda s: s.note == "")
 
 
-class Recorder:
-    """A core that keeps its inputs; publishes what it is told to."""
-
-    def __init__(self, outputs=()) -> None:
-        self.steps, self.begun, self.outputs = [], [], outputs
-
-    def begin(self, run, episode):
-        self.begun.append((run, episode))
-        return ()
-
-    def step(self, inputs):
-        self.steps.append(inputs)
-        return self.outputs
-
-
-BOTH = Service("both", inputs=(PERCEPT, TRUTH, GOAL), trigger=TRUTH, outputs=(PLAN,))
-
-
-def offer(stepper, topic, part=None, **changes) -> bool:
-    """Offers a sample; whether the core stepped."""
-    extra = {"object": part} if part else {}
-    stepper.offer(topic, part, sample(topic.type, **{"run": "r", "episode": 0, "step": 0} | extra | changes))
-    return stepper.advance() is not None
-
-
-def test_a_step_needs_every_topic_every_part_and_what_is_latched():
-    stepper = Stepper(BOTH, core := Recorder(), PARTS)
-    assert not offer(stepper, PERCEPT, "can")
-    assert not offer(stepper, TRUTH)
-    assert stepper.waits_for() == ["percept/mug of step 0 of episode 0", "goal of step 0 of episode 0"]
-    assert not offer(stepper, PERCEPT, "mug")
-    assert offer(stepper, GOAL)
-    assert list(core.steps[0]["percept"]) == list(PARTS)
-    assert list(core.steps[0]) == ["percept", "truth", "goal"]
-    assert core.begun == [("r", 0)]
-
-
-def test_a_latched_message_holds_from_its_step_on():
-    stepper = Stepper(Service("s", inputs=(TRUTH, GOAL), trigger=TRUTH, outputs=()), core := Recorder(), PARTS)
-    offer(stepper, GOAL, step=0, seq=0)
-    offer(stepper, GOAL, step=2, seq=1)
-    for step in range(4):
-        assert offer(stepper, TRUTH, step=step)
-    assert [inputs["goal"].seq for inputs in core.steps] == [0, 0, 1, 1]
-
-
-def test_a_new_episode_begins_with_its_first_complete_step():
-    stepper = Stepper(BOTH, core := Recorder(), ("mug",))
-    for episode in (0, 1):
-        offer(stepper, GOAL, episode=episode)
-        offer(stepper, PERCEPT, "mug", episode=episode)
-    assert offer(stepper, TRUTH, episode=0)
-    assert core.begun == [("r", 0)]
-    assert offer(stepper, TRUTH, episode=1)
-    assert core.begun == [("r", 0), ("r", 1)]
-    assert not offer(stepper, TRUTH, episode=0, step=5)
-    assert stepper.skipped == 0
-
-
-def test_an_incomplete_step_is_skipped_once_a_later_one_is_complete():
-    stepper = Stepper(BOTH, core := Recorder(), ("mug",))
-    offer(stepper, GOAL)
-    offer(stepper, TRUTH, step=0)
-    offer(stepper, TRUTH, step=1)
-    assert offer(stepper, PERCEPT, "mug", step=1)
-    assert stepper.skipped == 1
-    assert not offer(stepper, PERCEPT, "mug", step=0)
-    assert [inputs["truth"].step for inputs in core.steps] == [1]
-
-
-def test_a_second_message_of_a_step_and_a_wrong_step_for_a_source_are_refused():
-    stepper = Stepper(BOTH, Recorder(), PARTS)
-    offer(stepper, TRUTH)
-    with pytest.raises(MessageError, match="second"):
-        offer(stepper, TRUTH)
-    with pytest.raises(MessageError, match="not an input"):
-        offer(stepper, PLAN)
-    simulator = Stepper(*pairs(CONFIG)[0], PARTS, source=True)
-    simulator.begin("r", 0)
-    with pytest.raises(MessageError, match="step: 3, not 0"):
-        offer(simulator, ACTION, step=3)
-
-
-def test_stray_steps_do_not_pile_up():
-    stepper = Stepper(BOTH, Recorder(), PARTS)
-    for step in range(1000):
-        offer(stepper, TRUTH, step=step)
-        offer(stepper, GOAL, episode=step)
-    assert len(stepper._slots) + len(stepper._latched) < 600
-    assert stepper.skipped > 700
-
-
-def test_gaps_are_counted_per_key():
-    counter = GapCounter()
-    lost = [counter.lost(PERCEPT, part, sample(PERCEPT.type, run="r", seq=seq))
-            for part, seq in (("mug", 4), ("can", 0), ("mug", 5), ("can", 3), ("mug", 9), ("mug", 0), ("mug", 1))]
-    assert lost == [0, 0, 0, 2, 3, 0, 0]
-    assert GapCounter(from_start=True).lost(PERCEPT, "mug", sample(PERCEPT.type, seq=4)) == 4
-
-
 def test_lost_messages_show_in_the_status():
     with closing(Running("local", names=("evaluator",))) as running:
         running.until_status("evaluator", lambda s: s.state == "ready")
@@ -299,17 +197,17 @@ def test_lost_messages_show_in_the_status():
         assert status.gaps == 3
 
 
-def test_settled_arrays_are_aligned_frozen_and_no_ones_else():
-    message = sample(FRAME.type)
-    buffer = np.frombuffer(b"x" + message.depth_m.tobytes(), "f4", offset=1).reshape(message.depth_m.shape)
-    settled = settle(dataclasses.replace(message, depth_m=buffer))
-    for value in (settled.rgb, settled.depth_m, settled.world_from_camera):
-        assert value.flags.aligned
-        assert value.flags.c_contiguous
-        assert not value.flags.writeable
-    assert not np.shares_memory(settled.rgb, message.rgb)
-    assert settle(settled) is settled
-    assert encode(settled) == encode(message)
+class Saying:
+    """A core that gives what it is told to."""
+
+    def __init__(self, outputs) -> None:
+        self.outputs = outputs
+
+    def begin(self, run, episode):
+        return ()
+
+    def step(self, inputs):
+        return self.outputs
 
 
 def test_a_core_that_gives_an_invalid_message_publishes_nothing_of_that_step():
@@ -317,7 +215,7 @@ def test_a_core_that_gives_an_invalid_message_publishes_nothing_of_that_step():
     bus, inbox, seen = LocalBus(), Inbox(), queue.SimpleQueue()
     bus.subscribe([PLAN, STATUS], lambda *item: seen.put(item))
     service = Service("bad", inputs=(TRUTH,), trigger=TRUTH, outputs=(PLAN,))
-    thread = threading.Thread(target=lambda: serve(service, Recorder(bad), bus, PARTS, run="r", inbox=inbox))
+    thread = threading.Thread(target=lambda: serve(service, Saying(bad), bus, PARTS, run="r", inbox=inbox))
     thread.start()
     while decode(Status, seen.get(timeout=WAIT_S)[2]).state != "ready":
         pass

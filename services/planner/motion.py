@@ -18,7 +18,8 @@ _DETOUR = 1.12  # corners of a detour lie on a sphere this much larger: neighbou
 _AZIMUTH, _ELEVATION = fibonacci_hemisphere(48)
 _CORNERS = direction(_AZIMUTH, np.arcsin(2.0 * np.sin(_ELEVATION) - 1.0))  # even over the whole sphere
 _SHELLS_M = np.arange(0.01, 0.5, 0.01)  # how far to look for a place outside all spheres
-_SHARES = np.linspace(0.0, 0.95, 20)  # of the way from a goal to a sphere's centre
+_SHARES = np.linspace(0.05, 0.95, 19)  # of the way from a place to a sphere's centre
+_WORTH_M = 0.01  # for less, no long move into a sphere
 
 
 def step_towards(world_from_camera: ArrayLike, goal_world_from_camera: ArrayLike, spheres: Spheres,
@@ -33,25 +34,29 @@ def step_towards(world_from_camera: ArrayLike, goal_world_from_camera: ArrayLike
     goal = np.asarray(goal_world_from_camera, dtype=np.float64)
     here, there = camera[:3, 3], goal[:3, 3]
     way = way_around(here, there, spheres)
-    position = _along(way, step_m)
-    at_the_end = (position == way[-1]).all() or np.linalg.norm(here - there) <= step_m
-    if at_the_end and spheres.depth_m(there) > _SLACK_M:
-        position = reach(there, spheres, here)
+    gap = np.linalg.norm(way[-1] - there)  # none unless the goal is inside a sphere
+    inwards = gap > _SLACK_M and np.linalg.norm(here - there) <= gap + _SLACK_M
+    position = reach(there, spheres, here) if inwards else _along(way, step_m)
     return position - here, turn_towards(camera[:3, :3], goal[:3, :3])
 
 
 def reach(goal: ArrayLike, spheres: Spheres, start: ArrayLike) -> Array:
-    """The position [3] to command from `start` for which `clip` leaves the camera nearest to the goal.
+    """The position [3] to command from `start`, in one action, for which `clip` leaves the camera nearest to the goal.
 
-    A sphere pushes whatever is on the ray from its centre through the goal to the same place, past the spheres before
-    it: so some goals inside a sphere are reached by a command that lies deep in another.
+    A sphere pushes all that lies between its centre and a place to the same side, past the spheres before it. So a goal
+    inside one sphere can be reached by a command that lies deep in another; pushes by two are tried as well. A place
+    outside all spheres is preferred to one that is hardly nearer.
     """
     goal = np.asarray(goal, dtype=np.float64)
-    rays = goal + _SHARES[:, None, None] * (spheres.centers_m - goal)
-    commands = np.concatenate([_outside(goal, spheres)[None], rays.reshape(-1, 3)])
-    misses = np.array([np.linalg.norm(clip(command, spheres) - goal) for command in commands]).round(4)
-    misses[(np.abs(commands - start) > ACTION_LIMIT).any(axis=1)] = np.inf
-    return commands[np.argmin(misses)]
+    commands = goal[None]
+    for _ in range(2):
+        rays = commands[:, None, None] + _SHARES[:, None] * (spheres.centers_m[:, None] - commands[:, None, None])
+        commands = np.concatenate([commands, rays.reshape(-1, 3)])
+    commands = np.concatenate([_outside(goal, spheres)[None], commands])
+    misses = np.linalg.norm(clip(commands, spheres) - goal, axis=1)
+    misses[0] -= _WORTH_M
+    misses[1:][(np.abs(commands[1:] - start) > ACTION_LIMIT).any(axis=1)] = np.inf
+    return commands[np.argmin(misses.round(4))]
 
 
 def turn_towards(rotation: ArrayLike, goal_rotation: ArrayLike) -> Array:

@@ -165,9 +165,10 @@ class Shape:
             atlas.paste(Image.fromarray(padded), (x - _GUTTER_PX, y - _GUTTER_PX))
         points, pixels, faces = zip(self._side(), self._end(0), self._end(1), strict=True)
         starts = np.cumsum([0] + [len(p) for p in points[:-1]])
+        joined = np.concatenate([f + start for f, start in zip(faces, starts, strict=True)])
         texcoords = np.concatenate(pixels) / ATLAS_PX * (1, -1) + (0, 1)
         return Mesh(name, np.concatenate(points).astype(np.float32), texcoords.astype(np.float32),
-                    np.concatenate([f + s for f, s in zip(faces, starts[:-1], strict=True)]).astype(np.int32), np.array(atlas))
+                    joined.astype(np.int32), np.array(atlas))
 
 
 def _coffee_can() -> Mesh:
@@ -313,8 +314,7 @@ def _squeeze_bottle() -> Mesh:
     return shape.mesh("squeeze_bottle", art, lid)
 
 
-_MAKERS = dict(zip(PANTRY_NAMES, (_coffee_can, _cereal_box, _rice_box, _soup_can, _squeeze_bottle),
-                   strict=True))
+_MAKERS = dict(zip(PANTRY_NAMES, (_coffee_can, _cereal_box, _rice_box, _soup_can, _squeeze_bottle), strict=True))
 
 
 def make_mesh(name: str) -> Mesh:

@@ -1,0 +1,110 @@
+"""The recorder as a real process: killed, told to end, without room; the bus goes on in any case."""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from contextlib import closing
+from pathlib import Path
+
+from shared.bus import ZenohBus, free_endpoint
+from shared.config import Config
+from shared.messages import encode
+from shared.recording import RunReader, missing
+from shared.topics import ACTION, PERCEPT, STATUS
+from tests.samples import sample
+
+WAIT_S = 60
+MOST_LOST_S = 1.0  # what a killed recorder may lose
+
+
+class RecorderProcess:
+    """The real recorder on a bus, and a publisher beside it."""
+
+    def __init__(self, folder: Path, limit_bytes: int | None = None) -> None:
+        endpoint = free_endpoint("tcp/127.0.0.1:0")
+        self.bus = ZenohBus(endpoint, world="test", listen=True)
+        self.said: list = []
+        self.bus.subscribe([STATUS], lambda _topic, _part, payload: self.said.append(payload))
+        folder.mkdir(exist_ok=True)
+        Config().with_values({"bus.endpoint": endpoint, "bus.world": "test"}).save(folder / "config.json")
+        limit = (lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit_bytes,) * 2)) if limit_bytes else None
+        self.process = subprocess.Popen([sys.executable, "-m", "services.recorder", "--config", folder / "config.json"],
+                                        stderr=subprocess.PIPE, text=True, preexec_fn=limit)
+        self.until(lambda: b"ready" in b"".join(self.said))
+
+    def until(self, condition) -> None:
+        end = time.monotonic() + WAIT_S
+        while not condition():
+            assert time.monotonic() < end, "it did not come"
+            time.sleep(0.01)
+
+    def close(self) -> None:
+        self.process.kill()
+        self.process.communicate()
+        self.bus.close()
+
+
+def test_a_killed_recorder_loses_at_most_a_second(tmp_path):
+    """Each message carries the time at which it was sent: all those older than a second at the kill must be there."""
+    sent_s = {}
+    with closing(RecorderProcess(tmp_path / "run")) as recorder:
+        start = time.monotonic()
+        while (now := time.monotonic()) - start < 3.5:
+            step = len(sent_s)
+            sent_s[step] = now
+            message = sample(PERCEPT.type, object="mug", step=step, scale=now, seq=step)
+            recorder.bus.publish(PERCEPT, "mug", encode(message))
+            time.sleep(0.005)
+        killed_s = time.monotonic()
+        recorder.process.send_signal(signal.SIGKILL)
+        recorder.process.wait(WAIT_S)
+        reader = RunReader(tmp_path / "run" / "run.mcap")
+        recorded = {m.step: m.scale for t, _, m in reader if t == PERCEPT}
+    assert reader.cut is not None
+    assert all(recorded[step] == sent_s[step] for step in recorded)
+    owed = [step for step, at_s in sent_s.items() if at_s < killed_s - MOST_LOST_S]
+    assert len(owed) > 100
+    assert set(owed) <= set(recorded), f"lost {len(set(owed) - set(recorded))} of {len(owed)}"
+
+
+def test_the_recorder_finishes_its_file_and_tells_gaps(tmp_path):
+    with closing(RecorderProcess(tmp_path / "run")) as recorder:
+        for seq in (0, 1, 2, 5, 6):
+            recorder.bus.publish(ACTION, None, encode(sample(ACTION.type, step=seq, seq=seq)))
+        recorder.until(lambda: b"2 lost before action 5" in b"".join(recorder.said))
+        recorder.process.terminate()
+        _, error = recorder.process.communicate(timeout=WAIT_S)
+    assert recorder.process.returncode == 0
+    assert "lacks 2 messages" in error
+    report = missing(tmp_path / "run" / "run.mcap")
+    assert report.cut is None
+    assert report.lost == {"saccade/test/action": 2}
+
+
+def test_a_recorder_without_room_says_so_and_the_bus_goes_on(tmp_path):
+    with closing(RecorderProcess(tmp_path / "run", limit_bytes=600_000)) as recorder:
+        step = 0
+        while b"not recording" not in b"".join(recorder.said):
+            payload = encode(sample(ACTION.type, step=step, seq=step)) + os.urandom(3000)
+            recorder.bus.publish(ACTION, None, payload)
+            step += 1
+            time.sleep(0.01)
+            assert step < 20_000
+        assert recorder.process.poll() is None
+        recorder.process.terminate()
+        _, error = recorder.process.communicate(timeout=WAIT_S)
+    assert recorder.process.returncode == 2
+    assert error.startswith("saccade: recording stopped (")
+    assert error.count("\n") == 1
+    reader = RunReader(tmp_path / "run" / "run.mcap")
+    assert sum(e.topic == ACTION for e in reader.entries()) > 10
+
+
+def test_the_recorder_loads_neither_torch_nor_mujoco():
+    code = "import sys, services.recorder.core; print({'torch', 'mujoco', 'scipy'} & set(sys.modules))"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "set()\n"

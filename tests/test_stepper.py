@@ -1,0 +1,130 @@
+"""Which inputs make a step, what is latched, late or stray, and what number a message gets."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from shared.messages import MessageError, encode
+from shared.service import Service
+from shared.stepper import GapCounter, Stepper, settle
+from shared.topics import ACTION, FRAME, GOAL, PERCEPT, PLAN, TRUTH
+from tests.fakes.services import SIMULATOR, FakeSimulator
+from tests.samples import sample
+
+PARTS = ("mug", "can")
+
+
+class Keeper:
+    """A core that keeps its inputs."""
+
+    def __init__(self) -> None:
+        self.steps, self.begun = [], []
+
+    def begin(self, run, episode):
+        self.begun.append((run, episode))
+        return ()
+
+    def step(self, inputs):
+        self.steps.append(inputs)
+        return ()
+
+
+BOTH = Service("both", inputs=(PERCEPT, TRUTH, GOAL), trigger=TRUTH, outputs=(PLAN,))
+
+
+def offer(stepper, topic, part=None, **changes) -> bool:
+    """Offers a sample; whether the core stepped."""
+    extra = {"object": part} if part else {}
+    stepper.offer(topic, part, sample(topic.type, **{"run": "r", "episode": 0, "step": 0} | extra | changes))
+    return stepper.advance() is not None
+
+
+def test_a_step_needs_every_topic_every_part_and_what_is_latched():
+    stepper = Stepper(BOTH, core := Keeper(), PARTS)
+    assert not offer(stepper, PERCEPT, "can")
+    assert not offer(stepper, TRUTH)
+    assert stepper.waits_for() == ["percept/mug of step 0 of episode 0", "goal of step 0 of episode 0"]
+    assert not offer(stepper, PERCEPT, "mug")
+    assert offer(stepper, GOAL)
+    assert list(core.steps[0]["percept"]) == list(PARTS)
+    assert list(core.steps[0]) == ["percept", "truth", "goal"]
+    assert core.begun == [("r", 0)]
+
+
+def test_a_latched_message_holds_from_its_step_on():
+    stepper = Stepper(Service("s", inputs=(TRUTH, GOAL), trigger=TRUTH, outputs=()), core := Keeper(), PARTS)
+    offer(stepper, GOAL, step=0, seq=0)
+    offer(stepper, GOAL, step=2, seq=1)
+    for step in range(4):
+        assert offer(stepper, TRUTH, step=step)
+    assert [inputs["goal"].seq for inputs in core.steps] == [0, 0, 1, 1]
+
+
+def test_a_new_episode_begins_with_its_first_complete_step():
+    stepper = Stepper(BOTH, core := Keeper(), ("mug",))
+    for episode in (0, 1):
+        offer(stepper, GOAL, episode=episode)
+        offer(stepper, PERCEPT, "mug", episode=episode)
+    assert offer(stepper, TRUTH, episode=0)
+    assert core.begun == [("r", 0)]
+    assert offer(stepper, TRUTH, episode=1)
+    assert core.begun == [("r", 0), ("r", 1)]
+    assert not offer(stepper, TRUTH, episode=0, step=5)
+    assert stepper.skipped == 0
+
+
+def test_an_incomplete_step_is_skipped_once_a_later_one_is_complete():
+    stepper = Stepper(BOTH, core := Keeper(), ("mug",))
+    offer(stepper, GOAL)
+    offer(stepper, TRUTH, step=0)
+    offer(stepper, TRUTH, step=1)
+    assert offer(stepper, PERCEPT, "mug", step=1)
+    assert stepper.skipped == 1
+    assert not offer(stepper, PERCEPT, "mug", step=0)
+    assert [inputs["truth"].step for inputs in core.steps] == [1]
+
+
+def test_a_second_message_of_a_step_and_a_wrong_step_for_a_source_are_refused():
+    stepper = Stepper(BOTH, Keeper(), PARTS)
+    offer(stepper, TRUTH)
+    with pytest.raises(MessageError, match="second"):
+        offer(stepper, TRUTH)
+    with pytest.raises(MessageError, match="not an input"):
+        offer(stepper, PLAN)
+    simulator = Stepper(SIMULATOR, FakeSimulator(0, 1, 9), PARTS, source=True)
+    simulator.begin("r", 0)
+    with pytest.raises(MessageError, match="step: 3, not 0"):
+        offer(simulator, ACTION, step=3)
+
+
+def test_stray_steps_do_not_pile_up():
+    stepper = Stepper(BOTH, Keeper(), PARTS)
+    for step in range(1000):
+        offer(stepper, TRUTH, step=step)
+        offer(stepper, GOAL, episode=step)
+    assert len(stepper._slots) + len(stepper._latched) < 600
+    assert stepper.skipped > 700
+
+
+def test_gaps_are_counted_per_key():
+    counter = GapCounter()
+    lost = [counter.lost(PERCEPT, part, sample(PERCEPT.type, run="r", seq=seq))
+            for part, seq in (("mug", 4), ("can", 0), ("mug", 5), ("can", 3), ("mug", 9), ("mug", 0), ("mug", 1))]
+    assert lost == [0, 0, 0, 2, 3, 0, 0]
+    assert GapCounter(from_start=True).lost(PERCEPT, "mug", sample(PERCEPT.type, seq=4)) == 4
+
+
+def test_settled_arrays_are_aligned_frozen_and_no_ones_else():
+    message = sample(FRAME.type)
+    buffer = np.frombuffer(b"x" + message.depth_m.tobytes(), "f4", offset=1).reshape(message.depth_m.shape)
+    settled = settle(dataclasses.replace(message, depth_m=buffer))
+    for value in (settled.rgb, settled.depth_m, settled.world_from_camera):
+        assert value.flags.aligned
+        assert value.flags.c_contiguous
+        assert not value.flags.writeable
+    assert not np.shares_memory(settled.rgb, message.rgb)
+    assert settle(settled) is settled
+    assert encode(settled) == encode(message)
