@@ -25,9 +25,9 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from deploy import table
-from deploy.launch import ONE_THREAD
 from deploy.provenance import commit, machine, shown
 from deploy.registry import local_pairs, weight_hashes
+from deploy.threads import enforce_one_thread
 from services.simulator.core import names_in_use
 from services.simulator.objects import load_mesh
 from services.simulator.scenes import PAPER_SCENES, Scene, generate_split, load_scenes, save_scenes
@@ -164,8 +164,8 @@ def _take_up(plan: Plan, origin: dict[str, Any]) -> dict[str, dict[str, Any]]:
 
 def _finish(plan: Plan, origin: dict[str, Any], records: list[dict[str, Any]]) -> None:
     """Writes the one JSON object; results of an older state of the code say so."""
-    headers = [json.loads(line)["facts"] for line in plan.partial.read_text().splitlines() if line.startswith('{"facts"')]
-    commits = ", ".join(dict.fromkeys(header["commit"] for header in headers))
+    lines = [line for line in plan.partial.read_text().splitlines() if line.startswith('{"facts"')]
+    commits = ", ".join(dict.fromkeys(json.loads(line)["facts"]["commit"] for line in lines))
     text = json.dumps(origin | {"commit": commits, "results": records}, indent=1)
     draft = plan.out.with_name(plan.out.name + ".draft")
     draft.write_text(text + "\n")
@@ -191,7 +191,7 @@ def _records(plan: Plan, numbers: Sequence[int], jobs: int) -> Iterator[dict[str
     """The records of these scenes as they are ready."""
     if not numbers:
         return
-    os.environ.update(ONE_THREAD)  # before the processes start: threads would contend, and sums depend on their number
+    enforce_one_thread()
     context = multiprocessing.get_context("spawn")
     text = plan.config.model_dump_json()
     with ProcessPoolExecutor(min(jobs, len(numbers)), mp_context=context, initializer=_start_worker) as pool:
@@ -204,8 +204,8 @@ def _records(plan: Plan, numbers: Sequence[int], jobs: int) -> Iterator[dict[str
                 except SaccadeError as error:
                     raise SaccadeError(f"scene {scene}: {error}; the results so far are in {plan.partial}") from error
                 except BrokenProcessPool as error:
-                    raise SaccadeError(f"a process of the benchmark has died, perhaps for want of memory: the results so "
-                                       f"far are in {plan.partial}; give the same command again") from error
+                    raise SaccadeError("a process of the benchmark has died, perhaps for want of memory: the results "
+                                       f"so far are in {plan.partial}; give the same command again") from error
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             for child in multiprocessing.active_children():
@@ -226,9 +226,6 @@ def _start_worker() -> None:
 @functools.lru_cache(maxsize=1)
 def _cores(agent: str, config_text: str) -> tuple[Config, list]:
     """Meshes, OpenGL and weights are loaded once per process."""
-    import torch
-
-    torch.set_num_threads(1)
     config = Config.model_validate_json(config_text)
     return config, local_pairs(agent, config)
 

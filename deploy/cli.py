@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
+from deploy.threads import prefer_one_thread
 from shared.errors import SaccadeError
 
 EXIT_ERROR, EXIT_INTERRUPTED = 2, 130
@@ -174,6 +175,7 @@ def command_line() -> str:
 
 def main() -> None:
     """The console script: what the user can mend is one line and exit code 2, Ctrl-C one line and 130."""
+    prefer_one_thread()
     try:
         app()
     except SaccadeError as error:

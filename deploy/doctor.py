@@ -76,7 +76,8 @@ def examine(console: Console | None = None, which: tuple[Check, ...] | None = No
     for check in which or checks():
         finding = _look(check)
         state = "[green]ok[/]" if finding.ok else "[red]missing[/]" if check.needed else "[yellow]missing (optional)[/]"
-        table.add_row(check.name, state, _escape(finding.detail) + (f"\n[bold]{_escape(finding.mend)}[/]" if finding.mend else ""))
+        mend = f"\n[bold]{_escape(finding.mend)}[/]" if finding.mend else ""
+        table.add_row(check.name, state, _escape(finding.detail) + mend)
         lacking += [check.name] if check.needed and not finding.ok else []
     console.print(table)
     console.print(f"`saccade run` lacks: {', '.join(lacking)}" if lacking else "`saccade run` has all that it needs")
@@ -112,7 +113,7 @@ def opengl() -> Finding:
         done = subprocess.run([sys.executable, "-c", RENDER], env={**os.environ, "PYTHONPATH": path}, timeout=RENDER_S,
                               capture_output=True, text=True, check=False)
     except subprocess.TimeoutExpired:
-        return Finding(False, f"{backend}: no image after {RENDER_S:.0f} s", "set MUJOCO_GL to another one: osmesa or egl")
+        return Finding(False, f"{backend}: no image after {RENDER_S:.0f} s", "set MUJOCO_GL to osmesa or egl")
     if done.returncode:
         lines = done.stderr.strip().splitlines() or [f"the process ended with code {done.returncode}"]
         return Finding(False, f"{backend}: {lines[-1]}",
@@ -140,7 +141,8 @@ def zenoh() -> Finding:
         router.close()
     if arrived.is_set():
         return Finding(True, f"a message passed through {endpoint}")
-    return Finding(False, f"nothing came through {endpoint} in {ANSWER_S:.0f} s", "allow connections within this machine")
+    return Finding(False, f"nothing came through {endpoint} in {ANSWER_S:.0f} s",
+                   "allow connections within this machine")
 
 
 def shared_memory() -> Finding:

@@ -26,7 +26,7 @@ PRESENT_ABOVE = 0.5
 
 @dataclass
 class Story:
-    """What a log says about one episode: images [H, W, 3], and the camera's positions [K, 3] in the order of the way."""
+    """What a log says about one episode: images [H, W, 3], and the camera's positions [K, 3] in their order."""
 
     episode: int
     goal_rgb: NDArray[np.uint8] | None = None
@@ -114,8 +114,8 @@ def _from_above(axes: Axes, story: Story) -> None:
         axes.plot(*story.truth.centers_m[:, :2].T, "o", color="black", fillstyle="none", markersize=13,
                   label="true position", linestyle="none", zorder=4)
         if story.goal_is_known:
-            axes.plot(*story.truth.goal_world_from_camera[:2, 3], "*", color="black", markersize=13, label="goal's view",
-                      linestyle="none", zorder=4)
+            axes.plot(*story.truth.goal_world_from_camera[:2, 3], "*", color="black", markersize=13,
+                      label="goal's view", linestyle="none", zorder=4)
     path = np.array(story.path_m)
     axes.plot(*path[:, :2].T, "-", color="#555555", linewidth=1.5, label="camera's path", zorder=1)
     axes.plot(*path[-1, :2], "s", color="#555555", markersize=7, zorder=3)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from importlib import import_module
 
 from deploy.launch import PROCESSES, Process
+from deploy.threads import limit_torch
 from shared.config import Config
 from shared.errors import SaccadeError
 from shared.service import Core, Service
@@ -17,7 +18,7 @@ SOURCE, JUDGE, RECORDER = "simulator", "evaluator", "recorder"
 
 @dataclass(frozen=True)
 class Agent:
-    """`services` are processes of their own in deploy/launch.py; `cores` are modules that only run within one process."""
+    """`services` are processes of their own in deploy/launch.py; `cores` are modules that run within one alone."""
 
     services: tuple[str, ...] = ()
     cores: tuple[str, ...] = ()
@@ -48,7 +49,11 @@ def agent_pairs(agent: str, config: Config) -> list[Pair]:
 
 
 def local_pairs(agent: str, config: Config) -> list[Pair]:
-    """Everything that an in-process run needs: the simulator, the agent, the evaluator."""
+    """Everything that an in-process run needs: the simulator, the agent, the evaluator.
+
+    Limits torch's threads as the launcher does for its processes: else the bytes would not be those of the bus.
+    """
+    limit_torch()
     world, judge = (_pair(f"services.{name}.core", config) for name in (SOURCE, JUDGE))
     return [world, *agent_pairs(agent, config), judge]
 

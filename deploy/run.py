@@ -46,7 +46,8 @@ def run(config: Config, *, agent: str, out: Path | None, plain: bool, console: C
 def resolve(config: Config) -> Config:
     """The configuration with its objects named and its paths absolute."""
     scene = config.scene
-    paths = {"scene.file": scene.file, "scene.goal_image": scene.goal_image, "perception.weights": config.perception.weights}
+    paths = {"scene.file": scene.file, "scene.goal_image": scene.goal_image,
+             "perception.weights": config.perception.weights}
     return config.with_values({"scene.names": list(names_in_use(scene))} |
                               {key: path.resolve() for key, path in paths.items() if path is not None})
 
@@ -91,7 +92,9 @@ def _ending(config: Config, results: list[Result], progress: Progress) -> list[s
     lines = [_result_line(config, result) for result in results]
     if config.scene.explore:
         found = [belief for _, belief in sorted(progress.beliefs.items()) if belief.presence > 0.5]
-        lines += [f"found {b.object} at ({', '.join(f'{x:.3f}' for x in b.mean_m)}) m ± {spread_cm(b):.1f} cm" for b in found]
+        for belief in found:
+            where = ", ".join(f"{x:.3f}" for x in belief.mean_m)
+            lines.append(f"found {belief.object} at ({where}) m ± {spread_cm(belief):.1f} cm")
     elif len(results) > 1 and config.scene.goal_image is None:
         lines.append(f"reached {sum(r.success for r in results)} of {len(results)} goals")
     return lines

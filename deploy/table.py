@@ -115,11 +115,11 @@ def render(records: Sequence[Record], *, title: str) -> Table:
 
 def _cells(row: Row, paper: Figures | None) -> list[str]:
     share = row.success
-    cells = [[f"{100 * share.value:.1f}", f"{100 * share.low:.1f} – {100 * share.high:.1f}"]]
+    cells = [[f"{100 * share.value:.1f}", f"{100 * share.low:.1f} to {100 * share.high:.1f}"]]
     for estimate in row.means:
         known = estimate.standard_error is not None
         cells.append([f"{estimate.value:.3f}" + (f" ± {estimate.standard_error:.3f}" if known else ""),
-                      f"{estimate.low:.3f} – {estimate.high:.3f}" if known else "-"])
+                      f"{estimate.low:.3f} to {estimate.high:.3f}" if known else "-"])
     if paper is not None:
         cells[0].append(f"{paper.success_percent:.1f}")
         for i, value in enumerate(paper.means):

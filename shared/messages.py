@@ -97,6 +97,7 @@ class Belief(Message):
     Goal view: log posterior [E, A] over the direction (elevation, azimuth; world axes, grid of `viewing_grid`) from
     which the object looks as in the goal image; absent while there is no goal or the object has not been seen.
     `presence`: probability that the object is in the scene; `views`: how many views the pose is fused from.
+    `goal_range_m`: range at which the goal image shows it, by the measure of views alike; 0 where there is no posterior.
     """
 
     object: str
@@ -107,6 +108,7 @@ class Belief(Message):
     particles_m: array("f4", "N", 3)
     views: int
     goal_log_posterior: array("f4", "E", "A") | None = None
+    goal_range_m: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,4 +1,4 @@
-"""The benchmark: its figures, its choice of scenes, and that an interruption or the split over processes changes nothing."""
+"""The benchmark: its figures, its choice of scenes; neither an interruption nor the number of jobs changes a result."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from rich.console import Console
 
 import deploy.bench as bench_module
 from deploy.bench import Plan, bench, prepare, run_scene, spread
-from deploy.registry import AGENTS, agent_pairs, agent_processes, local_pairs
 from deploy.launch import PROCESSES
+from deploy.registry import AGENTS, agent_pairs, agent_processes, local_pairs
 from deploy.table import PAPER, TOTAL, mean, render, rows, wilson
 from services.simulator.scenes import PAPER_SCENES, load_scenes
 from shared.config import Config

@@ -74,7 +74,8 @@ class BeliefFilter:
             world_from_camera=np.array(percept.world_from_camera), mean_m=mean, covariance_m2=covariance,
             particles_m=position.sample(self.config.belief.published_particles, rng).astype(np.float32),
             views=len(goal_view.keyframes) if goal_view else 0,
-            goal_log_posterior=None if posterior is None else posterior.astype(np.float32))
+            goal_log_posterior=None if posterior is None else posterior.astype(np.float32),
+            goal_range_m=0.0 if posterior is None else goal_view.range_m(posterior))
 
 
 def build(config: Config) -> BeliefFilter:

@@ -1,7 +1,7 @@
 """From where an object would look like the goal: a posterior over its viewing hemisphere, fused over all views.
 
 Each view's latent pose is moved by every displacement to the cells of a grid; a cell is as likely as the goal's latent
-is under the moved one (paper, equations 2 and 5). Views at different places multiply; their disagreement is what makes the
+is under the moved one (paper, equations 2 and 5). Views at different places multiply; their disagreement makes the
 posterior of a nearly symmetric object multi-modal, and new views decide between the modes.
 """
 
@@ -15,23 +15,36 @@ from numpy.typing import NDArray
 
 from shared.config import BeliefConfig
 from shared.generative_model import Transition, log_density
-from shared.geometry import GRID_AZIMUTHS, GRID_ELEVATIONS, spherical, unit, viewing_grid, wrap
+from shared.geometry import (
+    GRID_AZIMUTHS,
+    GRID_ELEVATIONS,
+    REFERENCE_RANGE_M,
+    direction,
+    spherical,
+    unit,
+    viewing_grid,
+    wrap,
+)
 from shared.messages import Percept
 
 Array = NDArray[np.float64]
 
 OUTLIER = 0.05  # share of views whose latent says nothing
 NEW_VIEW_RAD = 0.08  # a view this near to a kept one adds nothing
+NEAR_RAD = 0.35  # views this near to the goal's direction say more about it
+NEAR_WEIGHT = 2.0  # by so much, at most
+SAME_SCALE = 0.3  # weight of the prior that the goal's range is as measured, against one near view
 MOVED_M = 0.01  # when the object is believed elsewhere by this much, the displacements are measured again
 
 
-@dataclass
+@dataclass(eq=False)
 class Keyframe:
     """A view that is kept: from where, what the latent was, and its log likelihood over the grid [E, A]."""
 
     eye: Array
     mean: torch.Tensor
     quality: float
+    range_m: float  # as the percept has it
     log_likelihood: Array
 
 
@@ -42,6 +55,7 @@ class GoalView:
         self.config, self.transition = config, transition
         self.goal_mean = torch.from_numpy(np.array(goal.latent_mean))
         self.goal_std = torch.from_numpy(np.array(goal.latent_std))
+        self.measured_range_m = REFERENCE_RANGE_M / goal.scale
         elevation, azimuth = viewing_grid()
         self.elevation, self.azimuth = (x.ravel() for x in np.meshgrid(elevation, azimuth, indexing="ij"))
         # cells cover less of the sphere towards the pole: the prior is even over directions, not over cells
@@ -64,7 +78,8 @@ class GoalView:
         if len(self.keyframes) >= self.config.keyframes:
             self.keyframes.remove(min(self.keyframes, key=lambda k: k.quality))
         mean = torch.from_numpy(np.array(percept.latent_mean))
-        self.keyframes.append(Keyframe(np.array(eye), mean, quality, self._likelihood(eye, mean)))
+        self.keyframes.append(Keyframe(np.array(eye), mean, quality, REFERENCE_RANGE_M / percept.scale,
+                                       self._likelihood(eye, mean)))
 
     @torch.inference_mode()
     def _likelihood(self, eye: Array, mean: torch.Tensor) -> Array:
@@ -82,9 +97,27 @@ class GoalView:
         """Normalised log probabilities [E, A]; None before the first view."""
         if not self.keyframes:
             return None
-        total = self.prior + self.config.view_temper * sum(k.log_likelihood for k in self.keyframes)
+        first = self._fuse(np.ones(len(self.keyframes)))
+        return self._fuse(1.0 + NEAR_WEIGHT * self._nearness(first))
+
+    def _fuse(self, weights: Array) -> Array:
+        total = self.prior + self.config.view_temper * sum(
+            w * k.log_likelihood for w, k in zip(weights, self.keyframes, strict=True))
         total -= total.max()
         return total - np.log(np.exp(total).sum())
+
+    def _nearness(self, log_posterior: Array) -> Array:
+        """How near each kept view is to the likeliest direction [views], 1 for the same."""
+        best = int(np.argmax(log_posterior))
+        towards = direction(self.azimuth[best], self.elevation[best])
+        cosines = np.array([unit(k.eye - self.center) @ towards for k in self.keyframes])
+        return np.exp(-0.5 * (np.arccos(np.clip(cosines, -1.0, 1.0)) / NEAR_RAD) ** 2)
+
+    def range_m(self, log_posterior: Array) -> float:
+        """The goal's range: as measured, corrected by what the same networks get wrong on views from about there."""
+        weights = self._nearness(log_posterior)
+        ratios = np.log([np.linalg.norm(k.eye - self.center) / k.range_m for k in self.keyframes])
+        return float(self.measured_range_m * np.exp(weights @ ratios / (weights.sum() + SAME_SCALE)))
 
 
 def _angle(a: Array, b: Array, center: Array) -> float:

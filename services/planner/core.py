@@ -8,6 +8,7 @@ so, and goes on to the next likely view should it still be asked to act.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 
 import numpy as np
 
@@ -29,9 +30,11 @@ SERVICE = Service("planner", inputs=(BELIEF, GOAL_PERCEPT), trigger=BELIEF, outp
 FOUND_M = 0.06  # deviation of the position below which the target counts as found
 KNOWN_M = 0.10  # objects less certain than this are no obstacle yet
 ARRIVED_M, ARRIVED_RAD = 0.01, 0.05
+STUCK_M = 0.002  # a camera that moves less is as near as it can be
 TURN_M = 0.10  # from here on the camera turns as planned; before, it keeps looking at what it is about
-VISITED_RAD = 0.45  # around a view that turned out not to be the goal
-VISITED_COST = 6.0  # nats
+VISITED_M = 0.06  # around a place that turned out not to be the goal's
+VISITED_COST = 8.0  # nats
+PEAK_RAD = 0.18  # the posterior's peak is averaged over this
 
 
 class Planner:
@@ -47,35 +50,47 @@ class Planner:
         self.viewpoint: Array | None = None
         self.plan: Plan | None = None
         self.age = 0
-        self.visited: list[Array] = []  # directions from the target
+        self.before: Array | None = None  # where the camera was
+        self.visited: list[Array] = []  # eyes from which the target was seen not to be as in the goal
         return ()
 
     def step(self, inputs: Inputs) -> Iterable[Output]:
         """A plan and an action from the beliefs of one step."""
         beliefs: dict[str, Belief] = inputs["belief"]
+        stamp = beliefs[self.names[0]]
+        camera = stamp.world_from_camera
         if not self.goal_known:
             self.goal_known = True
             if not self.config.scene.explore:
                 self.preference = infer_preference(inputs["goal_percept"], self.config.planner.range_std_m)
-        any_belief = beliefs[self.names[0]]
-        camera = any_belief.world_from_camera
+        self._refine(beliefs)
         spheres = self._obstacles(beliefs)
-        arrived = self.viewpoint is not None and _at(camera, self.viewpoint)
-        declared = False
-        if arrived and self.plan is not None and self.plan.mode == "goal":
-            declared = True
-            self.visited.append(unit(camera[:3, 3] - beliefs[self.plan.target].mean_m))
+        arrived = self._arrived(camera)
+        declared = arrived and self.plan is not None and self.plan.mode == "goal"
+        if declared:
+            self.visited.append(camera[:3, 3].copy())
         self.age += 1
         if self.plan is None or arrived or self.age >= self.config.planner.replan_every:
-            self._choose(any_belief, beliefs, camera, spheres)
-        elif self.plan.mode == "goal":
-            self.viewpoint = self._goal_viewpoint(beliefs[self.plan.target], spheres)
-        plan = self._publish(any_belief, camera, beliefs, declared)
+            self._choose(stamp, beliefs, camera, spheres)
+        self.before = camera
         heading = self._heading(camera, beliefs)
         translation, rotation = step_towards(camera, heading, spheres, self.config.planner.step_m)
+        plan = self._publish(stamp, camera, beliefs, declared)
         yield Output(PLAN, plan)
         yield Output(ACTION, Action(run=plan.run, episode=plan.episode, step=plan.step, translation_m=translation,
                                     rotation_rad=rotation, arrived=declared))
+
+    def _refine(self, beliefs: dict[str, Belief]) -> None:
+        """Takes the goal's range from the belief, which corrects it by what views alike get wrong."""
+        if self.preference and beliefs[self.preference.target].goal_range_m > 0:
+            self.preference = replace(self.preference, range_m=beliefs[self.preference.target].goal_range_m)
+
+    def _arrived(self, camera: Array) -> bool:
+        if self.viewpoint is None:
+            return False
+        moved = _between(camera, self.before) if self.before is not None and self.age > 1 else (1.0, 1.0)
+        near = _between(camera, self.viewpoint)
+        return (near[0] < ARRIVED_M and near[1] < ARRIVED_RAD) or (moved[0] < STUCK_M and moved[1] < ARRIVED_RAD)
 
     def _heading(self, camera: Array, beliefs: dict[str, Belief]) -> Array:
         """Where to go and how to look meanwhile [4, 4]: at the point of interest on the way, as planned on arrival."""
@@ -97,27 +112,29 @@ class Planner:
         rng = generator(self.config.seed, self.config.bus.world, self.episode, stamp.step, "planner")
         target = beliefs[self.preference.target] if self.preference else None
         found = target is not None and np.trace(target.covariance_m2) < FOUND_M ** 2 and target.presence > 0.5
-        eyes, gazes = self._candidates(target, beliefs, camera, rng)
-        eyes = np.clip(eyes, LOWER_M, UPPER_M)
-        mode = "goal" if found and target.goal_log_posterior is not None else "search"
-        if mode == "goal":
-            best = self._goal_viewpoint(target, spheres)
+        known = found and target.goal_log_posterior is not None
+        eyes, gazes = self._candidates(target, beliefs, rng)
+        if known:
+            best = self._goal_viewpoint(target, self._peak(target))
             eyes, gazes = np.vstack([eyes, best[:3, 3]]), np.vstack([gazes, target.mean_m])
-        preference = self.preference if found else None
-        terms = expected_free_energy(eyes, gazes, beliefs, preference, self.config.planner.information_weight)
-        cost = terms.total + self._visited_cost(eyes, target) if found else terms.total
-        if not found:  # among views that tell the same, the nearest
-            cost = cost + 0.3 * np.linalg.norm(eyes - camera[:3, 3], axis=1)
+        eyes = np.clip(eyes, LOWER_M, UPPER_M)
+        terms = expected_free_energy(eyes, gazes, beliefs, self.preference if found else None,
+                                     self.config.planner.information_weight)
+        if found:  # each time that the best was not it, the belief is trusted less, and other places are tried
+            doubt = 1.0 / (1.0 + len(self.visited))
+            cost = doubt * (terms.pose + terms.scale) + terms.position + terms.information + self._visited_cost(eyes)
+        else:  # among views that tell the same, the nearest
+            cost = terms.total + 0.3 * np.linalg.norm(eyes - camera[:3, 3], axis=1)
         chosen = int(np.argmin(cost))
-        viewpoint = look_at(clip(eyes[chosen], spheres), gazes[chosen])
-        if mode == "goal" and chosen == len(eyes) - 1:
-            viewpoint = best
-        elif mode == "goal":
-            mode = "approach"
-        self.viewpoint, self.age = viewpoint, 0
-        self.plan = self._plan(stamp, mode, gazes[chosen], terms, chosen)
+        if known:
+            self.viewpoint = best if chosen == len(eyes) - 1 else self._goal_viewpoint(target, eyes[chosen])
+        else:
+            self.viewpoint = look_at(clip(eyes[chosen], spheres), gazes[chosen])
+        self.age = 0
+        self.plan = self._plan(stamp, "goal" if known else "approach" if found else "search", gazes[chosen], terms,
+                               chosen)
 
-    def _candidates(self, target: Belief | None, beliefs: dict[str, Belief], camera: Array,
+    def _candidates(self, target: Belief | None, beliefs: dict[str, Belief],
                     rng: np.random.Generator) -> tuple[Array, Array]:
         """Eyes and look-at points [N, 3]: a third from the goal posterior, a third at the goal's range, a third
         anywhere; the look-at points from the particles."""
@@ -128,46 +145,42 @@ class Planner:
         eyes = rng.uniform(LOWER_M, UPPER_M, (count, 3))
         if self.preference is None:
             return eyes, gazes
-        third = count // 3
+        third, doubt = count // 3, 1.0 + len(self.visited)
         reach = self.preference.range_m + rng.normal(0, 0.10, third)
         away = unit(eyes[third:2 * third] - gazes[third:2 * third])
         eyes[third:2 * third] = gazes[third:2 * third] + np.maximum(reach, 0.1)[:, None] * away
         if target.goal_log_posterior is not None:
-            probabilities = np.exp(target.goal_log_posterior.astype(np.float64)).ravel()
+            probabilities = np.exp(target.goal_log_posterior.astype(np.float64) / doubt).ravel()
             cells = rng.choice(len(probabilities), size=third, p=probabilities / probabilities.sum())
             elevation, azimuth = viewing_grid()
             e, a = elevation[cells // len(azimuth)], azimuth[cells % len(azimuth)]
-            eyes[:third] = gazes[:third] + self.preference.range_m * direction(
-                a + rng.uniform(-0.04, 0.04, third), e + rng.uniform(-0.04, 0.04, third))
+            away = direction(a + rng.uniform(-0.045, 0.045, third), e + rng.uniform(-0.045, 0.045, third))
+            reach = self.preference.range_m * np.exp(rng.normal(0, 0.02 * doubt, third))
+            gazes[:third] = target.mean_m
+            eyes[:third] = gazes[:third] + reach[:, None] * away
         return eyes, gazes
 
-    def _visited_cost(self, eyes: Array, target: Belief) -> Array:
-        """A price on views of the target from where it was seen not to be the goal [N]."""
+    def _visited_cost(self, eyes: Array) -> Array:
+        """A price on places from where the target was seen not to be as in the goal [N]."""
         cost = np.zeros(len(eyes))
-        away = unit(eyes - target.mean_m)
         for seen in self.visited:
-            near = np.arccos(np.clip(away @ seen, -1, 1)) / VISITED_RAD
-            cost += VISITED_COST * np.exp(-0.5 * near ** 2)
+            cost += VISITED_COST * np.exp(-0.5 * ((eyes - seen) ** 2).sum(1) / VISITED_M ** 2)
         return cost
 
-    def _goal_viewpoint(self, target: Belief, spheres: Spheres) -> Array:
-        """Where the goal image was taken, as believed [4, 4]: the posterior's peak, at the goal's range, the target at
-        the goal's pixel. As in the environment, the position is clipped and the view direction kept."""
+    def _peak(self, target: Belief) -> Array:
+        """The eye [3] at the posterior's peak, averaged over its neighbours, at the goal's range."""
         elevation, azimuth = viewing_grid()
+        directions = direction(*np.meshgrid(azimuth, elevation))
         log_posterior = target.goal_log_posterior.astype(np.float64)
-        e_grid, a_grid = np.meshgrid(elevation, azimuth, indexing="ij")
-        directions = direction(a_grid, e_grid)
-        for seen in self.visited:
-            near = np.arccos(np.clip(directions @ seen, -1, 1)) / VISITED_RAD
-            log_posterior = log_posterior - VISITED_COST * np.exp(-0.5 * near ** 2)
         peak = np.unravel_index(np.argmax(log_posterior), log_posterior.shape)
-        near = directions @ directions[peak] > np.cos(0.18)
+        near = directions @ directions[peak] > np.cos(PEAK_RAD)
         mass = np.where(near, np.exp(log_posterior - log_posterior[peak]), 0.0)
-        centre = unit((directions * mass[..., None]).sum((0, 1)))
-        position = target.mean_m + self.preference.range_m * centre
-        viewpoint = aim(position, target.mean_m, self.preference.pixel, self.preference.intrinsics_px)
-        viewpoint[:3, 3] = clip(position, spheres)
-        return viewpoint
+        return target.mean_m + self.preference.range_m * unit((directions * mass[..., None]).sum((0, 1)))
+
+    def _goal_viewpoint(self, target: Belief, eye: Array) -> Array:
+        """The view from `eye` [3] that shows the target at the goal's pixel [4, 4]. As in the environment, the position
+        is clipped (when the camera moves there) and the attitude is kept."""
+        return aim(eye, target.mean_m, self.preference.pixel, self.preference.intrinsics_px)
 
     def _plan(self, stamp: Belief, mode: str, gaze: Array, terms: Terms, chosen: int) -> Plan:
         return Plan(
@@ -179,19 +192,16 @@ class Planner:
 
     def _publish(self, stamp: Belief, camera: Array, beliefs: dict[str, Belief], declared: bool) -> Plan:
         """The plan as it stands at this step."""
-        distance = -1.0
-        if self.preference and beliefs[self.preference.target].goal_log_posterior is not None:
-            goal = self._goal_viewpoint(beliefs[self.preference.target], Spheres(np.zeros((0, 3)), np.zeros(0)))
-            distance = float(np.linalg.norm(goal[:3, 3] - camera[:3, 3]))
-        fields = {name: getattr(self.plan, name) for name in (
-            "target", "mode", "look_at_m", "g_position", "g_scale", "g_pose", "g_information", "candidates")}
-        return Plan(run=stamp.run, episode=stamp.episode, step=stamp.step, viewpoint=self.viewpoint,
-                    believed_distance_m=distance, arrived=declared, **fields)
+        distance, target = -1.0, beliefs.get(self.plan.target)
+        if target is not None and target.goal_log_posterior is not None:
+            distance = float(np.linalg.norm(self._peak(target) - camera[:3, 3]))
+        return replace(self.plan, step=stamp.step, viewpoint=self.viewpoint, believed_distance_m=distance,
+                       arrived=declared)
 
 
-def _at(camera: Array, viewpoint: Array) -> bool:
-    return bool(np.linalg.norm(camera[:3, 3] - viewpoint[:3, 3]) < ARRIVED_M
-                and rotation_angle(camera[:3, :3], viewpoint[:3, :3]) < ARRIVED_RAD)
+def _between(a: Array, b: Array) -> tuple[float, float]:
+    """Distance (metres) and angle (radians) between two poses [4, 4]."""
+    return float(np.linalg.norm(a[:3, 3] - b[:3, 3])), float(rotation_angle(a[:3, :3], b[:3, :3]))
 
 
 def build(config: Config) -> Planner:

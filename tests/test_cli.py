@@ -1,0 +1,264 @@
+"""The front door: what it says, with which exit code, and what a run leaves behind."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import defaultdict
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+import deploy.cli as cli
+from deploy.doctor import Check, Finding, examine
+from deploy.run import run
+from services.simulator.scenes import PAPER_SCENES
+from shared.config import REPOSITORY, Config, load
+from shared.errors import SaccadeError
+from shared.recording import RunReader, missing
+from shared.topics import STATUS, TOPICS
+from tests.fakes.weights import write_random_weights
+
+NAMES = ("coffee_can", "soup_can")
+
+
+def call(monkeypatch, capsys, *arguments) -> tuple[int, str, str]:
+    """Exit code, stdout and stderr of a command, run within this process."""
+    monkeypatch.setattr(sys, "argv", ["saccade", *map(str, arguments)])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    out, err = capsys.readouterr()
+    return end.value.code or 0, out, err
+
+
+def started(*arguments, **more) -> subprocess.Popen:
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+    return subprocess.Popen([sys.executable, "-m", "deploy.cli", *map(str, arguments)], env=environment, text=True,
+                            stdout=subprocess.PIPE, stderr=subprocess.PIPE, **more)
+
+
+def living(group: int) -> list[str]:
+    """Processes of a group that have not ended."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            state, _, leader = path.read_text().rpartition(")")[2].split()[:3]
+        except OSError:
+            continue
+        if int(leader) == group and state != "Z":
+            found.append(path.parent.name)
+    return found
+
+
+def silent() -> Console:
+    return Console(file=io.StringIO(), width=200)
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("weights")
+    write_random_weights(folder, "pantry", NAMES)
+    return folder
+
+
+def small(weights, **values) -> Config:
+    return Config().with_values({"scene.names": list(NAMES), "perception.weights": str(weights), "seed": 3,
+                                 "simulator.max_steps": 4, "planner.candidates": 200} | values)
+
+
+# --- what the commands say
+
+def test_help_lists_the_commands(monkeypatch, capsys):
+    code, out, _ = call(monkeypatch, capsys, "--help")
+    assert code == 0
+    for command in ("run", "bench", "train", "doctor", "topics"):
+        assert f" {command} " in out
+
+
+def test_help_loads_nothing_heavy():
+    """So that it is there at once."""
+    script = "import sys, deploy.cli; print([m for m in ('torch', 'mujoco', 'zenoh', 'numpy') if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", script], cwd=REPOSITORY, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_topics_lists_the_registry(monkeypatch, capsys):
+    code, out, _ = call(monkeypatch, capsys, "topics", "--world", "kitchen")
+    assert code == 0
+    for topic in TOPICS.values():
+        assert topic.key("kitchen", "<part>" if topic.parts else None) in out
+        assert topic.type.__name__ in out
+
+
+@pytest.mark.parametrize(("arguments", "words"), [
+    (("run", "--set", "planner.stride=1"), "configuration key 'planner.stride' is unknown"),
+    (("run", "--set", "planner.step_m"), "--set 'planner.step_m': write KEY=VALUE"),
+    (("run", "--set", "planner.step_m=far"), "planner.step_m"),
+    (("run", "--config", "none.toml"), "none.toml cannot be read"),
+    (("run", "--names", "teapot"), "'teapot' is not in 'pantry': choose from coffee_can"),
+    (("run", "--agent", "nobody"), "agent 'nobody' is unknown: choose from sceneccn, oracle"),
+    (("run", "--agent", "oracle"), "add `--bus local`"),
+    (("run", "--weights", "none"), "none/manifest.json are missing: train them"),
+    (("run", "--agent", "oracle", "--bus", "local", "--scene", "s1"), "scene.scene needs scene.file"),
+    (("run", "--agent", "oracle", "--bus", "local", "--goal", "none.png"), "goal image"),
+    (("bench", "--agent", "oracle", "--scenes", PAPER_SCENES), "is not in use: choose the set that has it"),
+    (("bench", "--agent", "oracle", "--scenes", PAPER_SCENES, "--yaw", "random"), "--yaw is for scenes that are drawn"),
+    (("train", "--names", "teapot"), "'teapot' is not in 'pantry'"),
+])
+def test_what_the_user_can_mend_is_one_line_and_code_2(monkeypatch, capsys, tmp_path, arguments, words):
+    """And leaves nothing behind."""
+    monkeypatch.chdir(tmp_path)
+    code, _, err = call(monkeypatch, capsys, *arguments)
+    assert code == 2
+    assert err.startswith("saccade: ")
+    assert words in err
+    assert err.count("\n") == 1
+    assert not (tmp_path / "runs").exists()
+
+
+def test_unknown_options_are_refused(monkeypatch, capsys):
+    code, _, err = call(monkeypatch, capsys, "run", "--fast")
+    assert code == 2
+    assert "--fast" in err
+
+
+def test_options_go_before_the_file_and_set_before_all(tmp_path):
+    """file < option < --set; a value that is not JSON is text."""
+    (tmp_path / "c.toml").write_text('seed = 1\n[scene]\nobjects = "ycb"\nyaw = "fixed"\n[planner]\nstep_m = 0.01\n')
+    config = cli.configured(tmp_path / "c.toml", {"seed": 2, "scene.objects": None}, ["planner.step_m=0.03"])
+    assert (config.seed, config.scene.objects, config.scene.yaw, config.planner.step_m) == (2, "ycb", "fixed", 0.03)
+    assert cli.parse_value('scene.names=["a"]') == ("scene.names", ["a"])
+    assert cli.parse_value("bus.world=a=b") == ("bus.world", "a=b")
+    assert cli.split_names("a, b,") == ["a", "b"]
+
+
+def test_interrupt_is_one_line_and_code_130(monkeypatch, capsys):
+    def interrupt(*_arguments, **_options):
+        raise KeyboardInterrupt("half is done")
+
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        monkeypatch.setattr("deploy.doctor.examine", interrupt)
+        assert call(monkeypatch, capsys, "doctor")[::2] == (130, "saccade: interrupted: half is done\n")
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_ctrl_c_ends_a_benchmark_and_its_processes(tmp_path):
+    """Both get the signal, as from a terminal; the results so far are kept, and nobody is left."""
+    process = started("bench", "--agent", "oracle", "--jobs", "2", "--json", tmp_path / "o.json",
+                      start_new_session=True)
+    partial = tmp_path / "o.json.partial.jsonl"
+    try:
+        while process.poll() is None and (not partial.is_file() or partial.read_text().count("\n") < 3):
+            pass
+        os.killpg(process.pid, signal.SIGINT)
+        _, err = process.communicate(timeout=120)
+        assert process.returncode == 130
+        assert err.startswith("saccade: interrupted: the same command goes on from the ")
+        assert err.count("\n") == 1
+        assert partial.read_text().count("\n") >= 3
+        end = time.monotonic() + 60
+        while living(process.pid) and time.monotonic() < end:
+            time.sleep(0.1)
+        assert living(process.pid) == []
+    finally:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+
+
+# --- the doctor
+
+def test_doctor_says_what_is_missing_and_how_to_mend_it():
+    """Code 1 only for what the default run needs; a check that raises is a finding too."""
+    def broken() -> Finding:
+        raise SaccadeError("no [OpenGL]: install it")
+
+    good = Check("good", lambda: Finding(True, "here"))
+    optional = Check("optional", lambda: Finding(False, "not here", "fetch it"), needed=False)
+    console = silent()
+    assert examine(console, (good, optional)) == 0
+    assert examine(console, (good, Check("bad", broken))) == 1
+    text = console.file.getvalue()
+    for words in ("fetch it", "no [OpenGL]: install it", "missing (optional)", "lacks: bad"):
+        assert words in text
+
+
+def test_doctor_checks_this_machine(monkeypatch, capsys):
+    """Everything that the tests themselves need is found."""
+    code, out, _ = call(monkeypatch, capsys, "doctor")
+    states = {cells[1].strip(): cells[2].strip() for cells in (row.split("│") for row in out.splitlines())
+              if len(cells) > 3 and cells[1].strip()}
+    assert {name: states[name] for name in ("Python", "OpenGL", "Zenoh", "objects pantry")} == dict.fromkeys(
+        ("Python", "OpenGL", "Zenoh", "objects pantry"), "ok")
+    assert code == (0 if states["weights pantry"] == "ok" else 1)
+
+
+# --- runs
+
+def test_oracle_run_leaves_a_whole_log_configuration_and_picture(monkeypatch, capsys, tmp_path):
+    """As `saccade run --bus local` on a scene of the file; the log needs no other file to be understood."""
+    out = tmp_path / "run"
+    code, text, _ = call(monkeypatch, capsys, "run", "--agent", "oracle", "--bus", "local", "--seed", 4,
+                         "--n-objects", 2, "--yaw", "fixed", "--count", 2, "--out", out)
+    assert code == 0
+    assert "reached 2 of 2 goals" in text
+    assert "azimuth" in text
+    assert {path.name for path in out.iterdir()} == {"run.mcap", "config.json", "picture.png"}
+    report, config = missing(out / "run.mcap"), load(out / "config.json")
+    assert report.complete, report
+    assert (config.seed, config.scene.n_objects, config.scene.yaw, len(config.scene.names)) == (4, 2, "fixed", 5)
+    reader = RunReader(out / "run.mcap")
+    assert {message.run for _, _, message in reader} == {"run"}
+    assert json.loads(reader.configuration) == json.loads((out / "config.json").read_text())
+
+
+def test_bus_and_one_process_log_the_same_bytes(tmp_path, weights):
+    """The real agent as processes on Zenoh and within this process; but for the statuses, which time makes."""
+    logs = []
+    for kind in ("zenoh", "local"):
+        out = tmp_path / kind / "same"
+        run(small(weights, **{"bus.kind": kind}), agent="sceneccn", out=out, plain=True, console=silent())
+        logged = defaultdict(list)
+        for entry in RunReader(out / "run.mcap").entries():
+            if entry.topic != STATUS:
+                logged[entry.topic.name, entry.part].append(entry.payload)
+        logs.append(logged)
+        assert missing(out / "run.mcap").complete
+        assert (out / "picture.png").is_file()
+    assert logs[0] == logs[1]
+    assert len(logs[0]["action", None]) == 4
+
+
+def test_plain_display_shows_belief_and_truth(tmp_path, weights):
+    """A line at the start, then every tenth step."""
+    console = silent()
+    run(small(weights, **{"bus.kind": "local", "simulator.max_steps": 10}), agent="sceneccn", out=tmp_path / "r",
+        plain=True, console=console)
+    lines = console.file.getvalue().splitlines()
+    assert lines[0].startswith("episode 0 step 0  goal 0.")
+    assert any(line.startswith("episode 0 step 10") and "as believed" in line and " G " in line for line in lines)
+    assert any("in 10 steps; errors: azimuth" in line for line in lines)
+
+
+def test_exploring_tells_what_was_found_and_judges_nothing(tmp_path, weights):
+    console = silent()
+    run(small(weights, **{"bus.kind": "local", "scene.explore": True}), agent="sceneccn", out=tmp_path / "r",
+        plain=True, console=console)
+    text = console.file.getvalue()
+    assert "explored for 4 steps" in text
+    assert "goal" not in text.split("explored")[1].split("log,")[0]
+
+
+def test_a_run_is_never_written_over(tmp_path, weights):
+    (tmp_path / "r").mkdir()
+    (tmp_path / "r" / "run.mcap").write_bytes(b"precious")
+    with pytest.raises(SaccadeError, match="is there already: a run needs a new folder"):
+        run(small(weights), agent="sceneccn", out=tmp_path / "r", plain=True, console=silent())
+    assert (tmp_path / "r" / "run.mcap").read_bytes() == b"precious"
