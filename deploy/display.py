@@ -18,9 +18,10 @@ PER_SECOND = 8
 
 
 class Progress:
-    """What the messages of a run have told so far."""
+    """What the messages of a run have told so far. `judged`: the truth knows the goal's view, so distances tell."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, judged: bool = True) -> None:
+        self.judged = judged
         self.truth: Truth | None = None
         self.plan: Plan | None = None
         self.beliefs: dict[str, Belief] = {}
@@ -44,8 +45,8 @@ class Progress:
 
     @property
     def distance_m(self) -> float | None:
-        """From the camera to the goal's camera, in truth."""
-        if self.truth is None:
+        """From the camera to the goal's camera, in truth; None where nobody knows."""
+        if self.truth is None or not self.judged:
             return None
         return float(np.linalg.norm((self.truth.world_from_camera - self.truth.goal_world_from_camera)[:3, 3]))
 
@@ -67,9 +68,12 @@ def line(progress: Progress) -> str:
     truth, plan = progress.truth, progress.plan
     if truth is None:
         return "starting"
-    parts = [f"episode {truth.episode} step {truth.step}", f"goal {_metres(progress.distance_m)} away"]
+    parts = [f"episode {truth.episode} step {truth.step}"]
+    if progress.judged:
+        parts.append(f"goal {_metres(progress.distance_m)} away")
     if plan is not None:
-        parts[-1] += f", as believed {_metres(progress.believed_distance_m)}"
+        if plan.target:
+            parts.append(f"believed {_metres(progress.believed_distance_m)}")
         parts.append(f"{plan.mode} {plan.target}".strip())
         parts.append(f"G {plan.g:.1f}")
     parts += [f"{name} ±{spread_cm(belief):.1f} cm" for name, belief in sorted(progress.beliefs.items())
@@ -127,8 +131,8 @@ def _metres(distance_m: float | None) -> str:
 class Display:
     """Shows a run's messages on a console; a context manager. Plain where asked for and where nobody sits before it."""
 
-    def __init__(self, console: Console, *, plain: bool) -> None:
-        self.progress, self.console = Progress(), console
+    def __init__(self, console: Console, *, plain: bool, judged: bool = True) -> None:
+        self.progress, self.console = Progress(judged=judged), console
         self.plain = plain or not console.is_terminal
         self._live = Live(get_renderable=lambda: panel(self.progress), console=console, transient=True,
                           refresh_per_second=PER_SECOND)

@@ -132,5 +132,7 @@ def _title(story: Story) -> str:
     if story.result is None:
         return f"episode {story.episode}: cut short after {len(story.path_m)} views"
     result = story.result
-    how = "reached" if result.success else "declared" if result.declared else "not reached"
-    return f"{result.scene}: {how} after {result.steps} steps"
+    if story.goal_rgb is None:
+        return f"{result.scene}: explored for {result.steps} steps"
+    how = "reached" if result.success else "said to be reached" if result.declared else "not reached"
+    return f"{result.scene}: goal {how} after {result.steps} steps"

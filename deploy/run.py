@@ -31,7 +31,8 @@ def run(config: Config, *, agent: str, out: Path | None, plain: bool, console: C
     require_weights(agent, config)
     processes = agent_processes(agent) if config.bus.kind == "zenoh" else ()
     folder = _new_folder(out or Path("runs") / f"{time.strftime('%Y%m%d-%H%M%S')}-{config.seed}")
-    with Display(console, plain=plain) as display:
+    judged = not config.scene.explore and config.scene.goal_image is None
+    with Display(console, plain=plain, judged=judged) as display:
         if processes:
             results = launch(config, folder, display.take, processes)
         else:

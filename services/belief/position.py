@@ -17,10 +17,12 @@ from shared.messages import Percept
 Array = NDArray[np.float64]
 
 WORKSPACE_M = np.array([[-0.5, 0.5], [-0.5, 0.5], [0.0, 0.5]])
+VOLUME_M3 = float(np.prod(WORKSPACE_M[:, 1] - WORKSPACE_M[:, 0]))
 MODEL_STD_M = 0.006  # what no network can know: the box's centre against what is seen of it
 CORRELATION = 2.0  # successive views err alike: their deviations count this much larger
-OUTLIER = 1e-3  # share of percepts that are of something else
-FRESH_SHARE = 0.02  # of the particles, redrawn from each percept, so that a lost object is found again
+OUTLIER = 0.05  # share of percepts that are of something else, anywhere in the workspace
+BORN, BORN_VAGUE = 0.02, 0.7  # prior that the object is where it is now seen and not where it was believed to be:
+VAGUE_M = 0.12  # little, unless the cloud is wider than this and so says next to nothing
 MARGIN_PX = 30  # an object this near to the image's border need not be seen
 
 
@@ -72,21 +74,18 @@ class PositionFilter:
         return float(1.0 / (1.0 + np.exp(-np.clip(self.log_odds, -20, 20))))
 
     def seen(self, percept: Percept, rng: np.random.Generator) -> None:
-        """Positive evidence: particles gain by their density under the percept's Gaussian."""
+        """Positive evidence: particles gain by their density under the percept's Gaussian; some are drawn from it, so
+        that a lost object is found again, by two percepts that agree and not by a single wrong one."""
         evidence = evidence_of(percept)
         factor = np.linalg.cholesky(evidence.covariance)
-        density = _density(self.particles, evidence, factor)
-        mass = float(self.weights @ density)
-        # a cloud with next to nothing where the object is seen says nothing: draw there, as the percept says
-        share = FRESH_SHARE if mass > 0.01 else 0.7
-        fresh = rng.permutation(len(self.particles))[:int(share * len(self.particles))]
+        born = BORN_VAGUE if np.trace(self.moments()[1]) > VAGUE_M ** 2 else BORN
+        fresh = rng.permutation(len(self.particles))[:int(max(born, 0.05) * len(self.particles))]
         self.particles[fresh] = np.clip(evidence.mean + rng.standard_normal((len(fresh), 3)) @ factor.T,
                                         WORKSPACE_M[:, 0], WORKSPACE_M[:, 1])
-        if mass <= 0.01:
-            self.weights[fresh] = 1.0 / len(self.particles)
-        else:
-            self.weights[fresh] = FRESH_SHARE / len(fresh)
-        self._reweigh(_density(self.particles, evidence, factor) + OUTLIER, rng)
+        likelihood = (1 - born) * (_density(self.particles, evidence, factor) + OUTLIER / VOLUME_M3)
+        self.weights[fresh] = 1.0  # drawn from the percept itself, their share of the posterior is known:
+        likelihood[fresh] = born / VOLUME_M3 / len(fresh)
+        self._reweigh(likelihood, rng)
         odds = percept.presence / max(1.0 - percept.presence, 1e-3)
         self.log_odds = min(self.log_odds + np.log(max(odds, 1e-3)), 8.0)
 
@@ -121,9 +120,9 @@ class PositionFilter:
 
 
 def _density(points: Array, evidence: Evidence, factor: Array) -> Array:
-    """Gaussian density relative to its peak [N]."""
+    """Gaussian density [N], per cubic metre."""
     whitened = np.linalg.solve(factor, (points - evidence.mean).T)
-    return np.exp(-0.5 * (whitened ** 2).sum(0))
+    return np.exp(-0.5 * (whitened ** 2).sum(0)) / ((2 * np.pi) ** 1.5 * np.prod(np.diag(factor)))
 
 
 def in_view(points: Array, camera: Array, intrinsics_px: Array) -> NDArray[np.bool_]:
