@@ -75,6 +75,7 @@ class PlannerConfig(Section):
     replan_every: int = Field(10, ge=1)
     step_m: float = Field(0.05, gt=0, le=0.5)
     range_std_m: float = Field(0.025, gt=0)
+    goal_confidence: float = Field(0.2, ge=0, le=1)  # below it the goal image says nothing
     information_weight: float = Field(1.0, ge=0)
 
 

@@ -73,8 +73,9 @@ class Goal(Message):
 class Percept(Message):
     """What one object's network made of one image (paper, section 3.2), on `percept` and `goal_percept`.
 
-    `pixel` is the centre (u, v) of the object; `scale` = 0.40 m / range; the deviations are calibrated. The latent pose
-    is seen from the camera. On `goal_percept` the camera's pose is unknown and world_from_camera is the identity.
+    `pixel` is the centre (u, v) of the object; `scale` = 0.40 m / range; the deviations are calibrated.
+    `reconstruction_error`: squared error of the decoded crop where the mask says that the object is seen, summed. The
+    latent pose is seen from the camera. On `goal_percept` the camera's pose is unknown: the identity stands for it.
     """
 
     object: str
@@ -87,6 +88,7 @@ class Percept(Message):
     latent_std: array("f4", "L")
     intrinsics_px: array("f8", 4)
     world_from_camera: array("f8", 4, 4)
+    reconstruction_error: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,7 +99,8 @@ class Belief(Message):
     Goal view: log posterior [E, A] over the direction (elevation, azimuth; world axes, grid of `viewing_grid`) from
     which the object looks as in the goal image; absent while there is no goal or the object has not been seen.
     `presence`: probability that the object is in the scene; `views`: how many views the pose is fused from.
-    `goal_range_m`: range at which the goal image shows it, by the measure of views alike; 0 where there is no posterior.
+    `goal_range_m`: range at which the goal image shows it, by the measure of views alike; 0 without a posterior.
+    `f_*`: the terms of its variational free energy at this step, nats (paper, appendix A).
     """
 
     object: str
@@ -109,6 +112,16 @@ class Belief(Message):
     views: int
     goal_log_posterior: array("f4", "E", "A") | None = None
     goal_range_m: float = 0.0
+    f_pose: float = 0.0
+    f_identity: float = 0.0
+    f_crop: float = 0.0
+    f_position: float = 0.0
+    f_likelihood: float = 0.0
+
+    @property
+    def free_energy(self) -> float:
+        """Variational free energy F of this object at this step, nats (paper, appendix A): the sum of its terms."""
+        return self.f_pose + self.f_identity + self.f_crop + self.f_position + self.f_likelihood
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,6 +137,7 @@ class Plan(Message):
     g_pose: float  # -log P(p | v, goal): in the desired pose
     g_information: float  # minus the expected information gain about the positions, nats
     candidates: int
+    goal_confidence: float  # that the goal image shows the target
     believed_distance_m: float  # from here to the goal's viewpoint as believed; infinite is not allowed: -1 if unknown
     arrived: bool
 
@@ -149,8 +163,8 @@ class Action(Message):
 class Truth(Message):
     """The simulator's ground truth, for evaluator, viewer and oracle only. `done`: no further frame will come.
 
-    `keep_out_m`: radii of the spheres around the objects that the camera is pushed out of, in their order. The target's centre is also that
-    of its place in the goal image where it does not stand on the table. `step` counts the actions taken.
+    `keep_out_m`: radii of the spheres around the objects that the camera is pushed out of, in their order. The target's
+    centre is also that of its place in the goal image where it does not stand on the table. `step` counts the actions.
     """
 
     scene: str

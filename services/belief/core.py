@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import numpy as np
+from numpy.typing import NDArray
 
+from services.belief.free_energy import crop_term, identity_term, likelihood_term, pose_term, position_term
 from services.belief.pose import GoalView
 from services.belief.position import PositionFilter, evidence_of
 from shared.config import Config
@@ -18,6 +20,8 @@ from shared.topics import BELIEF, GOAL_PERCEPT, PERCEPT
 from shared.weights import Weights
 
 SERVICE = Service("belief", inputs=(PERCEPT, GOAL_PERCEPT), trigger=PERCEPT, outputs=(BELIEF,))
+
+Moments = tuple[NDArray[np.float64], NDArray[np.float64]]  # mean [3], covariance [3, 3]
 
 WORTH_COMPARING = 0.05  # goal presence below which an object's pose is not compared with the goal
 LOCALISED_M = 0.08  # deviation below which a view's displacement means something
@@ -38,6 +42,7 @@ class BeliefFilter:
         self.positions = {name: PositionFilter(self.config.belief, self._rng(0, f"start {name}"))
                           for name in self.names}
         self.goal_views: dict[str, GoalView] = {}
+        self.last_seen: dict[str, Percept] = {}
         self.goal_known = False
         return ()
 
@@ -59,6 +64,7 @@ class BeliefFilter:
     def _update(self, name: str, percepts: dict[str, Percept], present: set[str]) -> Belief:
         percept, position = percepts[name], self.positions[name]
         rng = self._rng(percept.step, name)
+        before, prior = position.moments(), position.presence
         if name in present:
             position.seen(percept, rng)
         else:
@@ -69,13 +75,27 @@ class BeliefFilter:
         if goal_view and name in present and np.trace(covariance) < LOCALISED_M ** 2:
             goal_view.seen(percept, mean)
         posterior = goal_view.log_posterior() if goal_view else None
+        energy = self._free_energy(percept, prior, before, (mean, covariance), name in present)
         return Belief(
             run=percept.run, episode=percept.episode, step=percept.step, object=name, presence=position.presence,
             world_from_camera=np.array(percept.world_from_camera), mean_m=mean, covariance_m2=covariance,
             particles_m=position.sample(self.config.belief.published_particles, rng).astype(np.float32),
             views=len(goal_view.keyframes) if goal_view else 0,
             goal_log_posterior=None if posterior is None else posterior.astype(np.float32),
-            goal_range_m=0.0 if posterior is None else goal_view.range_m(posterior))
+            goal_range_m=0.0 if posterior is None else goal_view.range_m(posterior), **energy)
+
+    def _free_energy(self, percept: Percept, prior: float, before: Moments, after: Moments,
+                     present: bool) -> dict[str, float]:
+        """The terms of F; those of an object that is not seen are what its absence says."""
+        terms = {"f_identity": identity_term(percept.presence, prior), "f_position": position_term(before, after)}
+        if not present:
+            return terms
+        last, name = self.last_seen.get(percept.object), percept.object
+        self.last_seen[name] = percept
+        terms |= {"f_crop": crop_term(percept, before), "f_likelihood": likelihood_term(percept)}
+        if last is not None:
+            terms["f_pose"] = pose_term(percept, last, after[0], self.transitions[name])
+        return terms
 
 
 def build(config: Config) -> BeliefFilter:

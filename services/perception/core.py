@@ -14,7 +14,7 @@ from services.perception.cropping import Cropper, Window
 from services.perception.networks import INPUT_PX, Extraction, Identity, tally
 from shared.config import Config
 from shared.errors import SaccadeError
-from shared.generative_model import Encoder, Stacked
+from shared.generative_model import Decoder, Encoder, Stacked
 from shared.messages import Frame, Goal, Percept
 from shared.service import Inputs, Output, Service
 from shared.topics import FRAME, GOAL, GOAL_PERCEPT, PERCEPT
@@ -34,7 +34,7 @@ class Seen:
     log_scale_std: NDArray[np.float64]
     latent_mean: NDArray[np.float32]
     latent_std: NDArray[np.float32]
-    crops: torch.Tensor  # [K, 4, 64, 64] masked crop and mask, for pictures
+    reconstruction_error: NDArray[np.float64]
 
 
 class SceneCCN:
@@ -46,6 +46,7 @@ class SceneCCN:
         self.extraction = weights.fill(Extraction(len(weights.names)), "extraction")
         self.identity = Stacked([weights.fill(Identity(), name, "identity.") for name in names])
         self.encoder = Stacked([weights.fill(Encoder(), name, "ccn.encoder.") for name in names])
+        self.decoder = Stacked([weights.fill(Decoder(), name, "ccn.decoder.") for name in names])
         self.sides_m = np.array([card.crop_side_m for card in self.cards])
         self.passes = passes
 
@@ -65,11 +66,12 @@ class SceneCCN:
             before, window = window, cropper.corrected(window, correction.double().clamp(-0.5, 0.5).numpy())
         masked = torch.cat([crops * crop_masks, crop_masks], dim=1)
         mean, std = (x[:, 0] for x in self.encoder(masked[:, None]))
+        error = ((self.decoder(mean[:, None])[:, 0] * crop_masks - masked[:, :3]) ** 2).sum((1, 2, 3))
         presence = (logit.sigmoid() * identity_logit.sigmoid()).double().numpy()
         deviation = log_std.exp().double().numpy()
         side_px = 2 * before.half_tangent * float(np.asarray(intrinsics_px)[0])
         return Seen(presence, window.pixels, side_px * deviation[:, :2].mean(1), window.scales, deviation[:, 2],
-                    mean.numpy(), std.numpy(), masked)
+                    mean.numpy(), std.numpy(), error.double().numpy())
 
 
 class Perception:
@@ -112,7 +114,8 @@ def percept(source: Frame | Goal, name: str, seen: Seen, k: int, world_from_came
         run=source.run, episode=source.episode, step=source.step, object=name, presence=float(seen.presence[k]),
         pixel=seen.pixel[k], pixel_std=float(seen.pixel_std[k]), scale=float(seen.scale[k]),
         log_scale_std=float(seen.log_scale_std[k]), latent_mean=seen.latent_mean[k], latent_std=seen.latent_std[k],
-        intrinsics_px=np.asarray(source.intrinsics_px), world_from_camera=np.asarray(world_from_camera))
+        intrinsics_px=np.asarray(source.intrinsics_px), world_from_camera=np.asarray(world_from_camera),
+        reconstruction_error=float(seen.reconstruction_error[k]))
 
 
 def build(config: Config) -> Perception:

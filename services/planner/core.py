@@ -61,8 +61,11 @@ class Planner:
         camera = stamp.world_from_camera
         if not self.goal_known:
             self.goal_known = True
-            if not self.config.scene.explore:
-                self.preference = infer_preference(inputs["goal_percept"], self.config.planner.range_std_m)
+            preference = infer_preference(inputs["goal_percept"], self.config.planner.range_std_m)
+            self.confidence = preference.confidence
+            # an image of nothing that is known sets no preference: what remains is to explore
+            known = preference.confidence >= self.config.planner.goal_confidence
+            self.preference = preference if known and not self.config.scene.explore else None
         self._refine(beliefs)
         spheres = self._obstacles(beliefs)
         arrived = self._arrived(camera)
@@ -188,6 +191,7 @@ class Planner:
             target=self.preference.target if self.preference else "", g_position=float(terms.position[chosen]),
             g_scale=float(terms.scale[chosen]), g_pose=float(terms.pose[chosen]),
             g_information=float(terms.information[chosen]), candidates=len(terms.position), believed_distance_m=-1.0,
+            goal_confidence=self.confidence,
             arrived=False)
 
     def _publish(self, stamp: Belief, camera: Array, beliefs: dict[str, Belief], declared: bool) -> Plan:
