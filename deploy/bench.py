@@ -8,34 +8,29 @@ from __future__ import annotations
 import functools
 import hashlib
 import json
-import multiprocessing
-import os
-import signal
-import threading
 import time
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from deploy import table
-from deploy.provenance import commit, machine, shown
-from deploy.registry import local_pairs, weight_hashes
-from deploy.threads import enforce_one_thread
+from deploy.provenance import machine, shown
+from deploy.registry import Pair, local_pairs, weight_hashes
+from deploy.suites import default_suite, suite_file
+from deploy.workers import in_processes
 from services.simulator.core import names_in_use
-from services.simulator.objects import load_mesh
-from services.simulator.scenes import PAPER_SCENES, Scene, generate_split, load_scenes, save_scenes
+from services.simulator.scenes import Scene, load_scenes
 from shared.config import Config
 from shared.errors import SaccadeError
 from shared.loop import run_local
 from shared.messages import Result
-from shared.service import Core, Inputs, Output
+from shared.provenance import commit
 from shared.topics import RESULT
 
 RUN = "bench"  # the same in every benchmark: it is in the messages
@@ -46,13 +41,17 @@ RECORD_KEYS = ("scene", "target", "objects", "success", "steps", "azimuth_error_
 
 @dataclass(frozen=True)
 class Plan:
-    """What is to be run: `config` as resolved by `prepare`, the file's scenes and the numbers of those in question."""
+    """What is to be run: `config` as resolved by `prepare`, the file's scenes and the numbers of those in question.
+
+    `suite` is the name under which the scenes are known, if any.
+    """
 
     agent: str
     config: Config
     scenes: tuple[Scene, ...]
     chosen: tuple[int, ...]
     out: Path
+    suite: str | None = None
 
     @property
     def partial(self) -> Path:
@@ -60,25 +59,23 @@ class Plan:
         return self.out.with_name(self.out.name + ".partial.jsonl")
 
 
-def prepare(agent: str, config: Config, out: Path, *, limit: int | None = None, yaw: str | None = None) -> Plan:
+def prepare(agent: str, config: Config, out: Path, *, suite: str | None = None, limit: int | None = None) -> Plan:
     """Resolves and checks everything before the first scene runs.
 
-    Without a file: the paper's scenes for its objects, else a split drawn like the paper's, kept beside `out`.
+    Without a file: the suite's scenes, kept beside `out` where they are drawn. Raises SaccadeError for both.
     """
+    if config.scene.file is not None and suite is not None:
+        raise SaccadeError("scenes come from a file or from a suite: leave --scenes or --suite out")
     names = names_in_use(config.scene)
     out.parent.mkdir(parents=True, exist_ok=True)
     path = config.scene.file
     if path is None:
-        path = PAPER_SCENES
-        if config.scene.objects != "ycb" or yaw is not None:
-            path = out.with_name(out.stem + ".scenes.json")
-            sizes = {name: load_mesh(config.scene.objects, name).size_m for name in names}
-            counts = range(1, len(names) + 1)
-            save_scenes(path, generate_split(sizes, seed=config.seed, counts=counts, yaw=yaw or "fixed"))
+        suite = suite or default_suite(config.scene.objects)
+        path = suite_file(suite, config, out.with_name(out.stem + ".scenes.json"))
     config = config.with_values({"scene.names": list(names), "scene.file": str(path.resolve()), "bus.kind": "local"})
     weight_hashes(agent, config)
     scenes = tuple(load_scenes(path, names))
-    return Plan(agent, config, scenes, spread(scenes, limit), out)
+    return Plan(agent, config, scenes, spread(scenes, limit), out, suite)
 
 
 def spread(scenes: Sequence[Scene], limit: int | None) -> tuple[int, ...]:
@@ -108,7 +105,7 @@ def facts(plan: Plan, command: str) -> dict[str, Any]:
     digest = hashlib.sha256(file.read_bytes()).hexdigest()
     return {"command": command, "commit": commit(), "agent": plan.agent, "objects": plan.config.scene.objects,
             "weights": weight_hashes(plan.agent, plan.config), "machine": machine(),
-            "scenes": {"file": shown(file), "sha256": digest}, "config": config}
+            "scenes": {"suite": plan.suite, "file": shown(file), "sha256": digest}, "config": config}
 
 
 def bench(plan: Plan, *, jobs: int, command: str, console: Console) -> list[dict[str, Any]]:
@@ -136,7 +133,8 @@ def bench(plan: Plan, *, jobs: int, command: str, console: Console) -> list[dict
         raise KeyboardInterrupt(f"the same command goes on from the {len(done)} scenes in {plan.partial}") from None
     records = [done[scene] for scene in wanted]
     _finish(plan, origin, records)
-    console.print(table.render(records, title=f"{plan.agent} on {plan.config.scene.objects}, {len(records)} scenes"))
+    where = f"{plan.config.scene.objects}, {plan.suite or plan.config.scene.file.name}"
+    console.print(table.render(records, title=f"{plan.agent} on {where}, {len(records)} scenes"))
     console.print(f"written to {plan.out}")
     return records
 
@@ -189,42 +187,17 @@ def _progress(console: Console, total: int) -> Iterator:
 
 def _records(plan: Plan, numbers: Sequence[int], jobs: int) -> Iterator[dict[str, Any]]:
     """The records of these scenes as they are ready."""
-    if not numbers:
-        return
-    enforce_one_thread()
-    context = multiprocessing.get_context("spawn")
     text = plan.config.model_dump_json()
-    with ProcessPoolExecutor(min(jobs, len(numbers)), mp_context=context, initializer=_start_worker) as pool:
-        waiting = {pool.submit(run_scene, plan.agent, text, number): number for number in numbers}
-        try:
-            for future in as_completed(waiting):
-                scene = plan.scenes[waiting[future]].id
-                try:
-                    yield future.result()
-                except SaccadeError as error:
-                    raise SaccadeError(f"scene {scene}: {error}; the results so far are in {plan.partial}") from error
-                except BrokenProcessPool as error:
-                    raise SaccadeError("a process of the benchmark has died, perhaps for want of memory: the results "
-                                       f"so far are in {plan.partial}; give the same command again") from error
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            for child in multiprocessing.active_children():
-                child.terminate()
-            raise
-
-
-def _start_worker() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
-
-    def watch() -> None:
-        multiprocessing.parent_process().join()
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
+    work = {plan.scenes[number].id: (plan.agent, text, number) for number in numbers}
+    try:
+        for _, record in in_processes(run_scene, work, jobs):
+            yield record
+    except SaccadeError as error:
+        raise SaccadeError(f"{error}; the results so far are in {plan.partial}") from error
 
 
 @functools.lru_cache(maxsize=1)
-def _cores(agent: str, config_text: str) -> tuple[Config, list]:
+def cores(agent: str, config_text: str) -> tuple[Config, list[Pair]]:
     """Meshes, OpenGL and weights are loaded once per process."""
     config = Config.model_validate_json(config_text)
     return config, local_pairs(agent, config)
@@ -232,39 +205,18 @@ def _cores(agent: str, config_text: str) -> tuple[Config, list]:
 
 def run_scene(agent: str, config_text: str, number: int) -> dict[str, Any]:
     """The record of one scene, run within this process as episode `number`."""
-    config, pairs = _cores(agent, config_text)
+    config, pairs = cores(agent, config_text)
     results: list[Result] = []
+    spent_ms: dict[str, list[float]] = {service.name: [] for service, _ in pairs}
     start = time.perf_counter()
-    run_local([(service, _as_episode(core, number)) for service, core in pairs], config.scene.names, RUN,
-              on_message=lambda topic, part, message, payload: results.append(message) if topic == RESULT else None)
+    run_local(pairs, config.scene.names, RUN, (number,),
+              lambda topic, part, message, payload: results.append(message) if topic == RESULT else None,
+              on_step=lambda service, milliseconds: spent_ms[service].append(milliseconds))
     seconds = round(time.perf_counter() - start, 3)
-    return {key: getattr(results[0], key) for key in RECORD_KEYS} | {"seconds": seconds}
+    means = {service: round(fmean(values), 3) for service, values in spent_ms.items() if values}
+    return record_of(results[0]) | {"seconds": seconds, "milliseconds": means}
 
 
-class _Episode:
-    """A core that takes part in episode `number`, which is the only one, 0, to whoever runs it."""
-
-    def __init__(self, core: Core, number: int):
-        self.core, self.number = core, number
-
-    def begin(self, run: str, episode: int) -> list[Output]:
-        return self._out(self.core.begin(run, self.number))
-
-    def step(self, inputs: Inputs) -> list[Output]:
-        return self._out(self.core.step({name: self._in(value) for name, value in inputs.items()}))
-
-    def _in(self, value: Any) -> Any:
-        if isinstance(value, dict):
-            return {part: self._in(message) for part, message in value.items()}
-        return replace(value, episode=self.number)
-
-    def _out(self, outputs) -> list[Output]:
-        return [replace(output, message=replace(output.message, episode=0)) for output in outputs]
-
-
-class _SourceEpisode(_Episode):
-    episodes = 1
-
-
-def _as_episode(core: Core, number: int) -> _Episode:
-    return (_SourceEpisode if hasattr(core, "episodes") else _Episode)(core, number)
+def record_of(result: Result) -> dict[str, Any]:
+    """What the results file says about an episode, but for its times."""
+    return {key: getattr(result, key) for key in RECORD_KEYS}

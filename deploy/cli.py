@@ -54,13 +54,16 @@ def run(*, objects: Objects = None, names: Names = None, scenes: ScenesFile = No
 
 @app.command()
 def bench(*, objects: Objects = None, scenes: ScenesFile = None,
+          suite: Annotated[str | None, typer.Option(
+              help="paper-500, yaw-500, lexa-room, dev (for tuning) or paper-like "
+                   "[default: paper-500 for ycb, paper-like for pantry]")] = None,
           agent: Annotated[str, typer.Option(help="which agent")] = "sceneccn",
           limit: Annotated[int | None, typer.Option(min=1, help="only so many scenes, evenly chosen")] = None,
           jobs: Annotated[int, typer.Option(min=1, help="processes at a time")] = 1,
           json: Annotated[Path | None, typer.Option(
-              help="file for the results [default: bench/<agent>_<set>.json]")] = None,
+              help="file for the results [default: bench/<agent>_<set>[_<suite>].json]")] = None,
           yaw: Annotated[Literal["random", "fixed"] | None, typer.Option(
-              help="draw the scenes instead of reading them, objects turned or not")] = None,
+              help="the suite paper-like, drawn from --seed, its objects turned or not")] = None,
           seed: Seed = None, weights: WeightsFolder = None, config: ConfigFile = None, values: Values = None) -> None:
     """Measure an agent on many scenes; given again after an interruption, go on from there."""
     from rich.console import Console
@@ -70,10 +73,12 @@ def bench(*, objects: Objects = None, scenes: ScenesFile = None,
 
     resolved = configured(config, {"scene.objects": objects, "scene.file": scenes, "seed": seed,
                                    "perception.weights": weights}, values)
-    if resolved.scene.file is not None and yaw is not None:
-        raise SaccadeError("--yaw is for scenes that are drawn: leave it or --scenes out")
-    plan = prepare(agent, resolved, json or Path("bench") / f"{agent}_{resolved.scene.objects}.json", limit=limit,
-                   yaw=yaw)
+    if yaw is not None and (resolved.scene.file is not None or suite is not None):
+        raise SaccadeError("--yaw is for scenes that are drawn: leave it or --scenes and --suite out")
+    if yaw is not None:
+        suite = {"fixed": "paper-like", "random": "paper-like-yaw"}[yaw]
+    name = "_".join(filter(None, (agent, resolved.scene.objects, suite)))
+    plan = prepare(agent, resolved, json or Path("bench") / f"{name}.json", suite=suite, limit=limit)
     run_bench(plan, jobs=jobs, command=command_line(), console=wide(Console()))
 
 

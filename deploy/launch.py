@@ -14,6 +14,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from deploy.threads import VARIABLES
 from services.simulator.objects import names_of
 from shared.bus import ZenohBus, free_endpoint
 from shared.config import REPOSITORY, Config
@@ -30,7 +31,6 @@ LOGS_NAME = "logs"
 READY_S = 120.0  # loading weights on a busy machine takes its time
 STOP_S = 10.0  # then a service that was told to stop is killed
 POLL_S = 0.2
-ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,8 @@ def _prepare(run_dir: Path) -> None:
 
 def _start(process: Process, run_dir: Path) -> subprocess.Popen:
     path = os.pathsep.join(filter(None, (str(REPOSITORY), os.environ.get("PYTHONPATH"))))
-    environment = {**ONE_THREAD, **os.environ, "PYTHONPATH": path, LAUNCHER_VARIABLE: str(os.getpid())}
+    environment = {**dict.fromkeys(VARIABLES, "1"), **os.environ, "PYTHONPATH": path,
+                   LAUNCHER_VARIABLE: str(os.getpid())}
     with _log_path(run_dir, process.name).open("wb") as log:
         return subprocess.Popen(  # a session of its own: Ctrl-C reaches the launcher, which then stops all in order
             [sys.executable, "-m", process.module, "--config", str(run_dir / CONFIG_NAME)], env=environment,

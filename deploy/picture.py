@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from dataclasses import dataclass, field
+from itertools import cycle
 from pathlib import Path
 
 import numpy as np
@@ -14,61 +16,69 @@ from numpy.typing import NDArray
 
 from services.simulator.world import TABLE_SIDE_M
 from shared.errors import SaccadeError
-from shared.messages import Belief, Plan, Result, Truth
+from shared.messages import Belief, Message, Plan, Result, Truth
 from shared.recording import RunReader
-from shared.topics import BELIEF, FRAME, GOAL, PLAN, RESULT, TRUTH
+from shared.topics import BELIEF, FRAME, GOAL, PLAN, RESULT, TRUTH, Topic
 
 COLOURS = ("#d1495b", "#00798c", "#edae49", "#7b2d8b", "#3a7d44", "#2e4057", "#f26419", "#66a182")
 INCHES, DPI = (15.0, 5.2), 100
 SHOWN_M = 0.62  # half the side of the view from above: the table and the camera's workspace
 PRESENT_ABOVE = 0.5
+TOLD = (GOAL, FRAME, BELIEF, TRUTH, PLAN, RESULT)
 
 
 @dataclass
 class Story:
-    """What a log says about one episode: images [H, W, 3], and the camera's positions [K, 3] in their order."""
+    """What the messages of one episode tell: images [H, W, 3], and the camera's position at each step [3]."""
 
     episode: int
     goal_rgb: NDArray[np.uint8] | None = None
     goal_is_known: bool = False  # that its view is the truth's, not that of an image from elsewhere
     last_rgb: NDArray[np.uint8] | None = None
     last_step: int = 0  # of `last_rgb`: the last move has no view of its own
-    path_m: list[NDArray[np.float64]] = field(default_factory=list)
+    ways: dict[int, NDArray[np.float64]] = field(default_factory=dict)
     beliefs: dict[str, Belief] = field(default_factory=dict)
     truth: Truth | None = None
     plan: Plan | None = None
     result: Result | None = None
 
+    @property
+    def path_m(self) -> list[NDArray[np.float64]]:
+        """The camera's positions in their order."""
+        return [self.ways[step] for step in sorted(self.ways)]
+
+    def take(self, topic: Topic, part: str | None, message: Message) -> None:
+        """Notes what a message of this episode says."""
+        if topic == GOAL:
+            self.goal_rgb = message.rgb
+        elif topic == FRAME:
+            self.last_rgb, self.last_step = message.rgb, message.step
+        elif topic == BELIEF:
+            self.beliefs[part] = message
+        elif topic == TRUTH:
+            self.truth = message
+        elif topic == PLAN:
+            self.plan = message
+        elif topic == RESULT:
+            self.result = message
+        if topic in (FRAME, TRUTH):  # the last step has a truth and no frame; a real camera has frames and no truth
+            self.ways[message.step] = message.world_from_camera[:3, 3]
+
 
 def read_story(log: Path, episode: int | None = None) -> Story:
     """The last episode of a log, or the one that is asked for. Raises SaccadeError if the log has no frame of it."""
-    story, ways = Story(-1 if episode is None else episode), {}
+    story = Story(-1 if episode is None else episode)
     reader = RunReader(log)
     for topic, part, message in reader:
-        if topic not in (GOAL, FRAME, BELIEF, TRUTH, PLAN, RESULT):
+        if topic not in TOLD:
             continue
         if episode is None and message.episode > story.episode:
-            story, ways = Story(message.episode), {}
-        if message.episode != story.episode:
-            continue
-        if topic == GOAL:
-            story.goal_rgb = message.rgb
-        elif topic == FRAME:
-            story.last_rgb, story.last_step = message.rgb, message.step
-        elif topic == BELIEF:
-            story.beliefs[part] = message
-        elif topic == TRUTH:
-            story.truth = message
-        elif topic == PLAN:
-            story.plan = message
-        else:
-            story.result = message
-        if topic in (FRAME, TRUTH):  # the last step has a truth and no frame; a real camera has frames and no truth
-            ways[message.step] = message.world_from_camera[:3, 3]
+            story = Story(message.episode)
+        if message.episode == story.episode:
+            story.take(topic, part, message)
     if story.last_rgb is None:
         which = "no episode" if episode is None else f"nothing of episode {episode}"
         raise SaccadeError(f"log {log} has {which} in it: draw a log that holds frames")
-    story.path_m = [ways[step] for step in sorted(ways)]
     story.goal_is_known = story.truth is not None and story.goal_rgb is not None and not _goal_from_elsewhere(reader)
     return story
 
@@ -79,23 +89,40 @@ def _goal_from_elsewhere(reader: RunReader) -> bool:
 
 
 def draw(log: Path, out: Path, episode: int | None = None) -> Story:
-    """Writes the picture of an episode as PNG and returns what it shows."""
+    """Writes the picture of a logged episode as PNG and returns what it shows."""
     story = read_story(log, episode)
-    figure = Figure(figsize=INCHES, dpi=DPI, layout="constrained")
-    FigureCanvasAgg(figure)
+    draw_story(story, out)
+    return story
+
+
+def draw_story(story: Story, out: Path, *, dpi: int = DPI) -> None:
+    """Writes the picture of an episode as PNG: the goal, the last view, the table from above."""
+    figure = new_figure(INCHES, dpi)
     goal, view, above = figure.subplots(1, 3)
-    _image(goal, story.goal_rgb, "goal" if story.goal_rgb is not None else "no goal: exploring")
-    _image(view, story.last_rgb, f"last view (step {story.last_step})")
+    image(goal, story.goal_rgb, "goal" if story.goal_rgb is not None else "no goal: exploring")
+    image(view, story.last_rgb, f"last view (step {story.last_step})")
     _from_above(above, story)
     figure.suptitle(_title(story))
+    save(figure, out)
+
+
+def new_figure(inches: tuple[float, float], dpi: int = DPI) -> Figure:
+    """A figure that needs no screen."""
+    figure = Figure(figsize=inches, dpi=dpi, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def save(figure: Figure, out: Path) -> None:
+    """Writes a figure; the same figure gives the same bytes. Raises SaccadeError where it cannot be written."""
     try:
         figure.savefig(out, metadata={"Software": None})
     except OSError as error:
         raise SaccadeError(f"picture {out} cannot be written: {error.strerror}") from error
-    return story
 
 
-def _image(axes: Axes, rgb: NDArray[np.uint8] | None, title: str) -> None:
+def image(axes: Axes, rgb: NDArray[np.uint8] | None, title: str) -> None:
+    """An image without axes, or the room for one."""
     axes.set_title(title)
     axes.axis("off")
     if rgb is not None:
@@ -103,29 +130,38 @@ def _image(axes: Axes, rgb: NDArray[np.uint8] | None, title: str) -> None:
 
 
 def _from_above(axes: Axes, story: Story) -> None:
-    half = TABLE_SIDE_M / 2
-    axes.fill([-half, half, half, -half], [-half, -half, half, half], color="#efeae2", zorder=0)
-    for colour, (name, belief) in zip(_colours(len(story.beliefs)), sorted(story.beliefs.items()), strict=True):
-        if belief.presence <= PRESENT_ABOVE:
-            continue
-        axes.scatter(*belief.particles_m[:, :2].T, s=4, color=colour, alpha=0.35, linewidths=0, zorder=2)
-        axes.plot(*belief.mean_m[:2], "o", color=colour, markersize=7, label=name, zorder=3)
+    table_from_above(axes, "the table from above")
+    particles(axes, {name: b for name, b in story.beliefs.items() if b.presence > PRESENT_ABOVE}, story.beliefs)
     if story.truth is not None:
         axes.plot(*story.truth.centers_m[:, :2].T, "o", color="black", fillstyle="none", markersize=13,
                   label="true position", linestyle="none", zorder=4)
         if story.goal_is_known:
             axes.plot(*story.truth.goal_world_from_camera[:2, 3], "*", color="black", markersize=13,
                       label="goal's view", linestyle="none", zorder=4)
-    path = np.array(story.path_m)
-    axes.plot(*path[:, :2].T, "-", color="#555555", linewidth=1.5, label="camera's path", zorder=1)
-    axes.plot(*path[-1, :2], "s", color="#555555", markersize=7, zorder=3)
-    axes.set(xlim=(-SHOWN_M, SHOWN_M), ylim=(-SHOWN_M, SHOWN_M), aspect="equal", xlabel="x (m)", ylabel="y (m)",
-             title="the table from above")
+    way(axes, np.array(story.path_m))
     axes.legend(loc="center left", bbox_to_anchor=(1.02, 0.5), fontsize=8, frameon=False)
 
 
-def _colours(count: int) -> list[str]:
-    return [COLOURS[i % len(COLOURS)] for i in range(count)]
+def table_from_above(axes: Axes, title: str) -> None:
+    """The empty table, x to the right and y up."""
+    half = TABLE_SIDE_M / 2
+    axes.fill([-half, half, half, -half], [-half, -half, half, half], color="#efeae2", zorder=0)
+    axes.set(xlim=(-SHOWN_M, SHOWN_M), ylim=(-SHOWN_M, SHOWN_M), aspect="equal", xlabel="x (m)", ylabel="y (m)",
+             title=title)
+
+
+def particles(axes: Axes, beliefs: dict[str, Belief], names: Iterable[str]) -> None:
+    """Where objects are believed to be; each of `names` keeps its colour, whichever of them are drawn."""
+    for colour, name in zip(cycle(COLOURS), sorted(names), strict=False):
+        if name in beliefs:
+            axes.scatter(*beliefs[name].particles_m[:, :2].T, s=4, color=colour, alpha=0.35, linewidths=0, zorder=2)
+            axes.plot(*beliefs[name].mean_m[:2], "o", color=colour, markersize=7, label=name, zorder=3)
+
+
+def way(axes: Axes, path_m: NDArray[np.float64]) -> None:
+    """The camera's path [K, 3] and where it is now."""
+    axes.plot(*path_m[:, :2].T, "-", color="#555555", linewidth=1.5, label="camera's path", zorder=1)
+    axes.plot(*path_m[-1, :2], "s", color="#555555", markersize=7, zorder=3)
 
 
 def _title(story: Story) -> str:

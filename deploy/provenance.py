@@ -1,10 +1,9 @@
-"""Where results come from: the code's state, the machine, paths that mean something elsewhere too."""
+"""Where results come from: the machine, and paths that mean something elsewhere too."""
 
 from __future__ import annotations
 
 import os
 import platform
-import subprocess
 from importlib import metadata
 from pathlib import Path
 
@@ -12,16 +11,6 @@ from services.simulator.opengl import choose_backend
 from shared.config import REPOSITORY
 
 PACKAGES = ("numpy", "torch", "mujoco")
-
-
-def commit() -> str:
-    """The commit of the source, with "-dirty" where it was changed since; "unknown" outside a checkout."""
-    try:
-        found = subprocess.run(["git", "-C", str(REPOSITORY), "describe", "--always", "--dirty"], capture_output=True,
-                               text=True, timeout=10, check=True)
-    except (OSError, subprocess.SubprocessError):
-        return "unknown"
-    return found.stdout.strip()
 
 
 def machine() -> dict[str, str | int]:

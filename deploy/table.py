@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from statistics import fmean, median, stdev
+from statistics import fmean, quantiles, stdev
 from typing import Any
 
 from rich.table import Table
@@ -36,6 +36,13 @@ PAPER = {
     TOTAL: Figures(69.0, (0.569, 0.231, 0.067), (0.034, 0.014, 0.004)),
 }
 
+PAPER_AGENTS = {  # all its agents on its 500 scenes
+    "PoseCNN (uses depth)": Figures(16.2, (1.277, 0.431, 0.186), (0.042, 0.015, 0.007)),
+    "PoseCNN + Infogain": Figures(28.4, (1.119, 0.367, 0.150), (0.045, 0.015, 0.007)),
+    "SceneCCN + AIF": PAPER[TOTAL],
+}
+PAPER_ROOM = {"PoseCNN": 17, "PoseCNN + Infogain": 30, "SceneCCN": 62, "LEXA (about 7 M steps)": 11}  # percent of 100
+
 
 @dataclass(frozen=True)
 class Estimate:
@@ -49,15 +56,18 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Row:
-    """What one target (or all of them) came to. Shares are fractions; `declared_true` is of those that declared."""
+    """What one target (or all of them) came to. Shares are fractions, of all scenes; `declared_true` of those in which
+    the agent said that it was there. A false alarm is one in which it was not, when it first said so."""
 
     name: str
     scenes: int
     success: Estimate
     means: tuple[Estimate, ...]  # in the order of MEASURES
     median_steps: float
+    middle_steps: tuple[float, float]  # the interquartile range
     declared: float
     declared_true: float | None
+    false_alarms: float
 
 
 def wilson(successes: int, trials: int) -> Estimate:
@@ -81,11 +91,27 @@ def mean(values: Sequence[float]) -> Estimate:
 
 def summarise(name: str, records: Sequence[Record]) -> Row:
     """The row of some results (at least one)."""
+    low, middle, high = quartiles([r["steps"] for r in records])
     declared = [r for r in records if r["declared"]]
+    rightly = sum(r["declared_true"] for r in declared)
     return Row(name, len(records), wilson(sum(r["success"] for r in records), len(records)),
-               tuple(mean([r[key] for r in records]) for key in MEASURES), median(r["steps"] for r in records),
-               len(declared) / len(records),
-               sum(r["declared_true"] for r in declared) / len(declared) if declared else None)
+               tuple(mean([r[key] for r in records]) for key in MEASURES), middle, (low, high),
+               len(declared) / len(records), rightly / len(declared) if declared else None,
+               (len(declared) - rightly) / len(records))
+
+
+def quartiles(values: Sequence[float]) -> tuple[float, float, float]:
+    """First quartile, median and third quartile, between neighbours where they fall between two values."""
+    return tuple(quantiles([*values, *values] if len(values) == 1 else values, n=4, method="inclusive"))
+
+
+def milliseconds(records: Sequence[Record]) -> dict[str, float]:
+    """Mean milliseconds per step of each service, over all steps of these results; of none where none were measured."""
+    measured = [r for r in records if r.get("milliseconds")]
+    services = dict.fromkeys(service for r in measured for service in r["milliseconds"])
+    sums = {s: [(r["milliseconds"][s] * r["steps"], r["steps"]) for r in measured if s in r["milliseconds"]]
+            for s in services}
+    return {s: sum(ms for ms, _ in parts) / max(1, sum(n for _, n in parts)) for s, parts in sums.items()}
 
 
 def rows(records: Sequence[Record]) -> list[Row]:
@@ -99,17 +125,22 @@ def render(records: Sequence[Record], *, title: str) -> Table:
     """The table for the terminal: three lines a target, ours, its 95 % interval, and the paper's where it has one."""
     theirs = "paper" if any(r["target"] in PAPER for r in records) else "paper (YCB)"
     caption = "± is the standard error of the mean; 95 % intervals: Wilson for success, normal for means"
+    caption += "; median steps: interquartile range; rightly: of those declared; false alarms: of all"
+    if spent := milliseconds(records):
+        caption += "\nmilliseconds per step: " + ", ".join(f"{name} {ms:.1f}" for name, ms in spent.items())
     table = Table(title=title, caption=caption, show_lines=True)
     for header in ("target", "", "n"):
         table.add_column(header)
-    for header in ("success (%)", *MEASURES.values(), "median steps", "declared", "rightly"):
+    for header in ("success (%)", *MEASURES.values(), "median steps", "declared", "rightly",
+                   "false alarms"):
         table.add_column(header, justify="right")
     for row in rows(records):
         paper = PAPER.get(row.name)
         labels = "\n".join(["ours", "95 %", *([theirs] if paper else [])])
         rightly = "-" if row.declared_true is None else f"{100 * row.declared_true:.0f} %"
-        table.add_row(row.name, labels, str(row.scenes), *_cells(row, paper), f"{row.median_steps:g}",
-                      f"{100 * row.declared:.0f} %", rightly, style="bold" if row.name == TOTAL else "")
+        steps = f"{row.median_steps:g}\n{row.middle_steps[0]:g} to {row.middle_steps[1]:g}"
+        table.add_row(row.name, labels, str(row.scenes), *_cells(row, paper), steps, f"{100 * row.declared:.0f} %",
+                      rightly, f"{100 * row.false_alarms:.0f} %", style="bold" if row.name == TOTAL else "")
     return table
 
 

@@ -65,7 +65,8 @@ class BeliefConfig(Section):
     missed_weight: float = Field(0.3, gt=0, le=1)
     published_particles: int = Field(512, ge=16)
     keyframes: int = Field(24, ge=1)
-    view_temper: float = Field(0.35, gt=0, le=1)  # views of one object are not independent
+    view_worth: float = Field(0.5, gt=0, le=1)  # how much a view counts for the pose,
+    views_worth: float = Field(2.5, gt=0)  # and all views together
 
 
 class PlannerConfig(Section):

@@ -40,7 +40,7 @@ def run_bench(plan: Plan, jobs: int = 1) -> list[dict]:
 
 
 def timeless(records: list[dict]) -> list[dict]:
-    return [{k: v for k, v in r.items() if k != "seconds"} for r in records]
+    return [{k: v for k, v in r.items() if k not in ("seconds", "milliseconds")} for r in records]
 
 
 # --- the table

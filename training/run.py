@@ -18,6 +18,7 @@ from services.simulator.objects import load_mesh
 from services.simulator.views import crop_side_m
 from shared.config import REPOSITORY
 from shared.errors import SaccadeError
+from shared.provenance import commit
 from shared.weights import ObjectCard, write_weights
 from training.dataset import render_missing
 from training.part import pick_device, read_checkpoint
@@ -107,14 +108,8 @@ def export(run_dir: Path, weights_dir: Path) -> None:
         cards.append(ObjectCard(name, size, crop_side_m(size)))
     write_weights(weights_dir, states, tuple(cards), {
         "data": f"{config.views} directions of each object of {config.objects!r}, from four ranges, composed",
-        "training": config.model_dump(mode="json"), "losses": losses, "commit": _commit(),
+        "training": config.model_dump(mode="json"), "losses": losses, "commit": commit(),
         "where_trained": _where(pick_device(config.device)), "seconds": round(seconds), "torch": torch.__version__})
-
-
-def _commit() -> str:
-    done = subprocess.run(["git", "describe", "--always", "--dirty", "--abbrev=40"], cwd=REPOSITORY,
-                          capture_output=True, text=True, check=False)
-    return done.stdout.strip() or "unknown"
 
 
 def _where(device: torch.device) -> str:

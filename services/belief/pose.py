@@ -32,7 +32,7 @@ Array = NDArray[np.float64]
 OUTLIER = 0.05  # share of views whose latent says nothing
 NEW_VIEW_RAD = 0.08  # a view this near to a kept one adds nothing
 NEAR_RAD = 0.35  # views this near to the goal's direction say more about it
-NEAR_WEIGHT = 2.0  # by so much, at most
+NEAR_WEIGHT = 5.0  # by so much, at most
 SAME_SCALE = 0.3  # weight of the prior that the goal's range is as measured, against one near view
 MOVED_M = 0.01  # when the object is believed elsewhere by this much, the displacements are measured again
 
@@ -101,8 +101,9 @@ class GoalView:
         return self._fuse(1.0 + NEAR_WEIGHT * self._nearness(first))
 
     def _fuse(self, weights: Array) -> Array:
-        total = self.prior + self.config.view_temper * sum(
-            w * k.log_likelihood for w, k in zip(weights, self.keyframes, strict=True))
+        # views are not independent, and they share the goal's own error: together they count for a few at most
+        worth = min(self.config.view_worth, self.config.views_worth / weights.sum())
+        total = self.prior + worth * sum(w * k.log_likelihood for w, k in zip(weights, self.keyframes, strict=True))
         total -= total.max()
         return total - np.log(np.exp(total).sum())
 

@@ -80,11 +80,12 @@ class PositionFilter:
         factor = np.linalg.cholesky(evidence.covariance)
         born = BORN_VAGUE if np.trace(self.moments()[1]) > VAGUE_M ** 2 else BORN
         fresh = rng.permutation(len(self.particles))[:int(max(born, 0.05) * len(self.particles))]
-        self.particles[fresh] = np.clip(evidence.mean + rng.standard_normal((len(fresh), 3)) @ factor.T,
-                                        WORKSPACE_M[:, 0], WORKSPACE_M[:, 1])
+        drawn = evidence.mean + rng.standard_normal((len(fresh), 3)) @ factor.T
+        inside = ((drawn > WORKSPACE_M[:, 0]) & (drawn < WORKSPACE_M[:, 1])).all(1)
+        self.particles[fresh] = np.where(inside[:, None], drawn, self.particles[fresh])
         likelihood = (1 - born) * (_density(self.particles, evidence, factor) + OUTLIER / VOLUME_M3)
         self.weights[fresh] = 1.0  # drawn from the percept itself, their share of the posterior is known:
-        likelihood[fresh] = born / VOLUME_M3 / len(fresh)
+        likelihood[fresh] = np.where(inside, born / VOLUME_M3 / len(fresh), 0.0)
         self._reweigh(likelihood, rng)
         odds = percept.presence / max(1.0 - percept.presence, 1e-3)
         self.log_odds = min(self.log_odds + np.log(max(odds, 1e-3)), 8.0)

@@ -17,7 +17,16 @@ from services.planner.goal import aim, infer_preference
 from services.planner.motion import step_towards
 from shared.config import Config
 from shared.errors import SaccadeError
-from shared.geometry import Array, direction, look_at, rotation_angle, unit, viewing_grid
+from shared.geometry import (
+    Array,
+    direction,
+    look_at,
+    rotation_angle,
+    rotation_towards,
+    unit,
+    viewing_grid,
+    wrap,
+)
 from shared.messages import Action, Belief, Plan
 from shared.seeding import generator
 from shared.service import Inputs, Output, Service
@@ -32,9 +41,9 @@ KNOWN_M = 0.10  # objects less certain than this are no obstacle yet
 ARRIVED_M, ARRIVED_RAD = 0.01, 0.05
 STUCK_M = 0.002  # a camera that moves less is as near as it can be
 TURN_M = 0.10  # from here on the camera turns as planned; before, it keeps looking at what it is about
-VISITED_M = 0.06  # around a place that turned out not to be the goal's
+VISITED_M, VISITED_RAD = 0.06, 0.4  # around a view that turned out not to be the goal's
 VISITED_COST = 8.0  # nats
-PEAK_RAD = 0.18  # the posterior's peak is averaged over this
+PEAK_CELLS = (2, 4)  # the posterior's peak is averaged over so many cells of elevation and azimuth to each side
 
 
 class Planner:
@@ -51,7 +60,7 @@ class Planner:
         self.plan: Plan | None = None
         self.age = 0
         self.before: Array | None = None  # where the camera was
-        self.visited: list[Array] = []  # eyes from which the target was seen not to be as in the goal
+        self.visited: list[Array] = []  # views [4, 4] in which the target was seen not to be as in the goal
         return ()
 
     def step(self, inputs: Inputs) -> Iterable[Output]:
@@ -71,10 +80,11 @@ class Planner:
         arrived = self._arrived(camera)
         declared = arrived and self.plan is not None and self.plan.mode == "goal"
         if declared:
-            self.visited.append(camera[:3, 3].copy())
+            self.visited.append(camera)
         self.age += 1
-        if self.plan is None or arrived or self.age >= self.config.planner.replan_every:
-            self._choose(stamp, beliefs, camera, spheres)
+        mode = self._mode(beliefs)
+        if self.plan is None or arrived or mode != self.plan.mode or self.age >= self.config.planner.replan_every:
+            self._choose(stamp, mode, beliefs, camera, spheres)
         self.before = camera
         heading = self._heading(camera, beliefs)
         translation, rotation = step_towards(camera, heading, spheres, self.config.planner.step_m)
@@ -110,12 +120,18 @@ class Planner:
         return spheres_around(np.array([b.mean_m for b in known]).reshape(-1, 3),
                               np.array([self.sizes_m[b.object] for b in known]).reshape(-1, 3))
 
-    def _choose(self, stamp: Belief, beliefs: dict[str, Belief], camera: Array, spheres: Spheres) -> None:
+    def _mode(self, beliefs: dict[str, Belief]) -> str:
+        """search: the target is not found; approach: found, but its goal view is not known; goal: it is."""
+        target = beliefs[self.preference.target] if self.preference else None
+        if target is None or np.trace(target.covariance_m2) > FOUND_M ** 2 or target.presence <= 0.5:
+            return "search"
+        return "approach" if target.goal_log_posterior is None else "goal"
+
+    def _choose(self, stamp: Belief, mode: str, beliefs: dict[str, Belief], camera: Array, spheres: Spheres) -> None:
         """Draws candidates, weighs them, takes the best."""
         rng = generator(self.config.seed, self.config.bus.world, self.episode, stamp.step, "planner")
         target = beliefs[self.preference.target] if self.preference else None
-        found = target is not None and np.trace(target.covariance_m2) < FOUND_M ** 2 and target.presence > 0.5
-        known = found and target.goal_log_posterior is not None
+        found, known = mode != "search", mode == "goal"
         eyes, gazes = self._candidates(target, beliefs, rng)
         if known:
             best = self._goal_viewpoint(target, self._peak(target))
@@ -125,7 +141,8 @@ class Planner:
                                      self.config.planner.information_weight)
         if found:  # each time that the best was not it, the belief is trusted less, and other places are tried
             doubt = 1.0 / (1.0 + len(self.visited))
-            cost = doubt * (terms.pose + terms.scale) + terms.position + terms.information + self._visited_cost(eyes)
+            cost = doubt * (terms.pose + terms.scale) + terms.position + terms.information
+            cost = cost + self._visited_cost(eyes, target.mean_m)
         else:  # among views that tell the same, the nearest
             cost = terms.total + 0.3 * np.linalg.norm(eyes - camera[:3, 3], axis=1)
         chosen = int(np.argmin(cost))
@@ -134,8 +151,7 @@ class Planner:
         else:
             self.viewpoint = look_at(clip(eyes[chosen], spheres), gazes[chosen])
         self.age = 0
-        self.plan = self._plan(stamp, "goal" if known else "approach" if found else "search", gazes[chosen], terms,
-                               chosen)
+        self.plan = self._plan(stamp, mode, gazes[chosen], terms, chosen)
 
     def _candidates(self, target: Belief | None, beliefs: dict[str, Belief],
                     rng: np.random.Generator) -> tuple[Array, Array]:
@@ -163,22 +179,29 @@ class Planner:
             eyes[:third] = gazes[:third] + reach[:, None] * away
         return eyes, gazes
 
-    def _visited_cost(self, eyes: Array) -> Array:
-        """A price on places from where the target was seen not to be as in the goal [N]."""
+    def _visited_cost(self, eyes: Array, center: Array) -> Array:
+        """A price on views of `center` [3] like those in which the target was seen not to be as in the goal [N]."""
         cost = np.zeros(len(eyes))
+        rotations = rotation_towards(center - eyes) if self.visited else None
         for seen in self.visited:
-            cost += VISITED_COST * np.exp(-0.5 * ((eyes - seen) ** 2).sum(1) / VISITED_M ** 2)
+            far = ((eyes - seen[:3, 3]) ** 2).sum(1) / VISITED_M ** 2
+            turned = (rotation_angle(rotations, seen[:3, :3]) / VISITED_RAD) ** 2
+            cost += VISITED_COST * np.exp(-0.5 * (far + turned))
         return cost
 
     def _peak(self, target: Belief) -> Array:
-        """The eye [3] at the posterior's peak, averaged over its neighbours, at the goal's range."""
+        """The eye [3] at the posterior's peak, averaged over its neighbours, at the goal's range. Azimuth and elevation
+        are averaged apart: near the pole neighbours in space may be views turned half round."""
         elevation, azimuth = viewing_grid()
-        directions = direction(*np.meshgrid(azimuth, elevation))
         log_posterior = target.goal_log_posterior.astype(np.float64)
-        peak = np.unravel_index(np.argmax(log_posterior), log_posterior.shape)
-        near = directions @ directions[peak] > np.cos(PEAK_RAD)
-        mass = np.where(near, np.exp(log_posterior - log_posterior[peak]), 0.0)
-        return target.mean_m + self.preference.range_m * unit((directions * mass[..., None]).sum((0, 1)))
+        row, column = np.unravel_index(np.argmax(log_posterior), log_posterior.shape)
+        rows = np.arange(max(row - PEAK_CELLS[0], 0), min(row + PEAK_CELLS[0] + 1, len(elevation)))
+        columns = np.arange(column - PEAK_CELLS[1], column + PEAK_CELLS[1] + 1) % len(azimuth)
+        mass = np.exp(log_posterior[np.ix_(rows, columns)] - log_posterior[row, column])
+        mass /= mass.sum()
+        mean_azimuth = azimuth[column] + (mass * wrap(azimuth[columns] - azimuth[column])).sum()
+        mean_elevation = (mass * elevation[rows][:, None]).sum()
+        return target.mean_m + self.preference.range_m * direction(mean_azimuth, mean_elevation)
 
     def _goal_viewpoint(self, target: Belief, eye: Array) -> Array:
         """The view from `eye` [3] that shows the target at the goal's pixel [4, 4]. As in the environment, the position

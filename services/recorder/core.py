@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import hashlib
 import platform
-import subprocess
 import sys
 from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
 
 from shared.bus import Bus, ZenohBus
-from shared.config import REPOSITORY, Config
+from shared.config import Config
 from shared.messages import MessageError, decode
 from shared.process import Health, Heartbeat, Inbox, Item, run_process
+from shared.provenance import commit
 from shared.recording import FLUSH_S, RecordingStopped, RunLog
 from shared.stepper import GapCounter
 
@@ -88,7 +88,7 @@ def _take(item: Item, log: RunLog, health: Health, gaps: GapCounter) -> None:
 def describe(config: Config, run: str) -> dict[str, dict[str, str]]:
     """What the log says about its origin: configuration hash, seed, versions, weights' hashes."""
     text = config.model_dump_json()
-    return {"run": {"run": run, "seed": str(config.seed), "commit": _commit(),
+    return {"run": {"run": run, "seed": str(config.seed), "commit": commit(),
                     "configuration_sha256": hashlib.sha256(text.encode()).hexdigest()},
             "versions": {"python": platform.python_version(), **{name: _version(name) for name in PACKAGES}},
             "weights_sha256": {str(p.relative_to(config.weights)): hashlib.sha256(p.read_bytes()).hexdigest()
@@ -100,13 +100,3 @@ def _version(package: str) -> str:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
         return "absent"
-
-
-def _commit() -> str:
-    """The source's commit where it is a checkout."""
-    try:
-        found = subprocess.run(["git", "-C", str(REPOSITORY), "rev-parse", "HEAD"], capture_output=True, text=True,
-                               timeout=5, check=True)
-    except (OSError, subprocess.SubprocessError):
-        return "unknown"
-    return found.stdout.strip()

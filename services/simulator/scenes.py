@@ -179,14 +179,21 @@ def generate_scene(rng: np.random.Generator, sizes: Sizes, target: str, n_object
     centers = np.c_[_spread(rng, np.linalg.norm(extents[:, :2], axis=1) / 2), extents[:, 2] / 2]
     yaws = rng.uniform(-np.pi, np.pi, n_objects) if yaw == "random" else np.zeros(n_objects)
     index = names.index(target)
+    goal = draw_goal(rng, centers, extents, index)
+    red, green, blue = (int(value) for value in rng.integers(0, 256, 3))
+    objects = tuple(Placed(*placed) for placed in zip(names, centers, yaws.tolist(), strict=True))
+    return Scene(scene_id, target, (red, green, blue), objects, goal)
+
+
+def draw_goal(rng: np.random.Generator, centers_m: ArrayLike, sizes_m: ArrayLike, index: int) -> NDArray[np.float64]:
+    """A goal view [4, 4] of object `index` of those with box centres [N, 3] and extents [N, 3] (paper, section 4.1)."""
+    centers, extents = np.asarray(centers_m, dtype=np.float64), np.asarray(sizes_m, dtype=np.float64)
     azimuth, elevation = rng.uniform(0, 2 * np.pi), rng.uniform(0, np.pi / 2)
     nearest = min(np.linalg.norm(extents[index]) / 2 + GOAL_CLEARANCE_M, GOAL_RANGE_MAX_M)
     position = centers[index] + rng.uniform(nearest, GOAL_RANGE_MAX_M) * direction(azimuth, elevation)
     goal = look_at(position, centers[index])
     goal[:3, 3] = clip(position, spheres_around(centers, extents))
-    red, green, blue = (int(value) for value in rng.integers(0, 256, 3))
-    objects = tuple(Placed(*placed) for placed in zip(names, centers, yaws.tolist(), strict=True))
-    return Scene(scene_id, target, (red, green, blue), objects, goal)
+    return goal
 
 
 def _spread(rng: np.random.Generator, radii_m: NDArray[np.float64]) -> NDArray[np.float64]:
