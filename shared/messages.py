@@ -100,6 +100,7 @@ class Belief(Message):
     which the object looks as in the goal image; absent while there is no goal or the object has not been seen.
     `presence`: probability that the object is in the scene; `views`: how many views the pose is fused from.
     `goal_range_m`: range at which the goal image shows it, by the measure of views alike; 0 without a posterior.
+    `goal_here`: probability, by the present view alone, that the goal image was taken from about this direction.
     `f_*`: the terms of its variational free energy at this step, nats (paper, appendix A).
     """
 
@@ -112,6 +113,7 @@ class Belief(Message):
     views: int
     goal_log_posterior: array("f4", "E", "A") | None = None
     goal_range_m: float = 0.0
+    goal_here: float = 0.0
     f_pose: float = 0.0
     f_identity: float = 0.0
     f_crop: float = 0.0

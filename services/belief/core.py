@@ -82,7 +82,8 @@ class BeliefFilter:
             particles_m=position.sample(self.config.belief.published_particles, rng).astype(np.float32),
             views=len(goal_view.keyframes) if goal_view else 0,
             goal_log_posterior=None if posterior is None else posterior.astype(np.float32),
-            goal_range_m=0.0 if posterior is None else goal_view.range_m(posterior), **energy)
+            goal_range_m=0.0 if posterior is None else goal_view.range_m(posterior),
+            goal_here=goal_view.here(percept) if posterior is not None and name in present else 0.0, **energy)
 
     def _free_energy(self, percept: Percept, prior: float, before: Moments, after: Moments,
                      present: bool) -> dict[str, float]:

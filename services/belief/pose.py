@@ -31,6 +31,7 @@ Array = NDArray[np.float64]
 
 OUTLIER = 0.05  # share of views whose latent says nothing
 NEW_VIEW_RAD = 0.08  # a view this near to a kept one adds nothing
+HERE_RAD, TURNED_RAD = 0.25, 0.5  # directions and turns of the image that would pass for the goal's
 NEAR_RAD = 0.35  # views this near to the goal's direction say more about it
 NEAR_WEIGHT = 5.0  # by so much, at most
 SAME_SCALE = 0.3  # weight of the prior that the goal's range is as measured, against one near view
@@ -80,6 +81,17 @@ class GoalView:
         mean = torch.from_numpy(np.array(percept.latent_mean))
         self.keyframes.append(Keyframe(np.array(eye), mean, quality, REFERENCE_RANGE_M / percept.scale,
                                        self._likelihood(eye, mean)))
+
+    def here(self, percept: Percept) -> float:
+        """Share of the present view's say that falls to the directions around its own."""
+        eye = percept.world_from_camera[:3, 3]
+        share = np.exp(self._likelihood(eye, torch.from_numpy(np.array(percept.latent_mean)))).ravel()
+        near = direction(self.azimuth, self.elevation) @ unit(eye - self.center) > np.cos(HERE_RAD)
+        # near the pole the azimuth turns the image: only what is turned as seen from here counts
+        azimuth, elevation, _ = spherical(eye, self.center)
+        turned = np.abs(wrap(self.azimuth - azimuth)) < HERE_RAD / max(np.cos(elevation), HERE_RAD)
+        upright = (elevation < np.pi / 2 - 3 * HERE_RAD) | (np.abs(wrap(self.azimuth - azimuth)) < TURNED_RAD)
+        return float(share[near & turned & upright].sum())
 
     @torch.inference_mode()
     def _likelihood(self, eye: Array, mean: torch.Tensor) -> Array:

@@ -43,6 +43,7 @@ STUCK_M = 0.002  # a camera that moves less is as near as it can be
 TURN_M = 0.10  # from here on the camera turns as planned; before, it keeps looking at what it is about
 VISITED_M, VISITED_RAD = 0.06, 0.4  # around a view that turned out not to be the goal's
 VISITED_COST = 8.0  # nats
+SURE = 0.6  # that this is the goal's view, before the agent says so
 PEAK_CELLS = (2, 4)  # the posterior's peak is averaged over so many cells of elevation and azimuth to each side
 
 
@@ -78,8 +79,9 @@ class Planner:
         self._refine(beliefs)
         spheres = self._obstacles(beliefs)
         arrived = self._arrived(camera)
-        declared = arrived and self.plan is not None and self.plan.mode == "goal"
-        if declared:
+        there = arrived and self.plan is not None and self.plan.mode == "goal"
+        declared = there and beliefs[self.plan.target].goal_here > SURE
+        if there:
             self.visited.append(camera)
         self.age += 1
         mode = self._mode(beliefs)
