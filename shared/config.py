@@ -45,6 +45,7 @@ class SimulatorConfig(Section):
     """The paper's environment (section 4.1)."""
 
     max_steps: int = Field(350, ge=1)
+    until: Literal["reached", "declared"] = "reached"  # the paper's any-time success, or the agent's own word
     publish_depth: bool = False  # no agent of ours needs it
 
 

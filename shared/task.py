@@ -6,6 +6,7 @@ Pure functions of poses: no rendering, so that simulator, evaluator, planner and
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -94,12 +95,16 @@ def errors(position: ArrayLike, goal_position: ArrayLike, target_center: ArrayLi
 
 
 class Episode:
-    """The camera's way through one scene, by the rules. Without a goal to judge by (`judged=False`) none succeeds."""
+    """The camera's way through one scene, by the rules. Without a goal to judge by (`judged=False`) none succeeds.
+
+    It ends at the goal, as in the paper, or with `until="declared"` when the agent first says that it is there.
+    """
 
     def __init__(self, goal_world_from_camera: ArrayLike, spheres: Spheres, *, max_steps: int = MAX_STEPS,
-                 judged: bool = True):
+                 judged: bool = True, until: Literal["reached", "declared"] = "reached"):
         self.goal = np.asarray(goal_world_from_camera, dtype=np.float64)
-        self.spheres, self.max_steps, self.judged = spheres, max_steps, judged
+        self.spheres, self.max_steps, self.judged, self.until = spheres, max_steps, judged, until
+        self.reached = False  # whether the camera has been at the goal, at any step
         self.step, self.declared, self.declared_true = 0, False, False
         self.camera = self._allowed(start_pose())
 
@@ -111,6 +116,7 @@ class Episode:
         """Moves. `arrived`: the agent says that with this move it is there; judged once, the first time."""
         self.camera = self._allowed(apply_action(self.camera, translation_m, rotation_rad))
         self.step += 1
+        self.reached |= self.success
         if arrived and not self.declared:
             self.declared, self.declared_true = True, self.success
 
@@ -121,5 +127,5 @@ class Episode:
 
     @property
     def done(self) -> bool:
-        """Whether the episode is over: at the goal, or out of steps."""
-        return self.success or self.step >= self.max_steps
+        """Whether the episode is over: at the goal (or declared to be), or out of steps."""
+        return (self.reached if self.until == "reached" else self.declared) or self.step >= self.max_steps

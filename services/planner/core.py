@@ -90,6 +90,8 @@ class Planner:
         self.before = camera
         heading = self._heading(camera, beliefs)
         translation, rotation = step_towards(camera, heading, spheres, self.config.planner.step_m)
+        if declared:  # it is judged where it says so
+            translation, rotation = np.zeros(3), np.zeros(3)
         plan = self._publish(stamp, camera, beliefs, declared)
         yield Output(PLAN, plan)
         yield Output(ACTION, Action(run=plan.run, episode=plan.episode, step=plan.step, translation_m=translation,

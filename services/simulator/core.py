@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,9 +34,11 @@ class Simulator:
     """
 
     def __init__(self, world: World, scenes: Sequence[Scene], *, max_steps: int = MAX_STEPS,
-                 publish_depth: bool = False, goal_rgb: NDArray[np.uint8] | None = None, explore: bool = False):
+                 publish_depth: bool = False, goal_rgb: NDArray[np.uint8] | None = None, explore: bool = False,
+                 until: Literal["reached", "declared"] = "reached"):
         self.world, self.scenes, self.max_steps = world, tuple(scenes), max_steps
         self.publish_depth, self.goal_rgb, self.explore = publish_depth, goal_rgb, explore
+        self.until = "declared" if goal_rgb is not None else until
 
     @property
     def episodes(self) -> int:
@@ -51,7 +54,8 @@ class Simulator:
         present = self.scene.on_table
         spheres = spheres_around([p.center_m for p in present], [self.world.meshes[p.name].size_m for p in present])
         judged = self.goal_rgb is None and not self.explore
-        self.state = Episode(self.scene.goal_world_from_camera, spheres, max_steps=self.max_steps, judged=judged)
+        self.state = Episode(self.scene.goal_world_from_camera, spheres, max_steps=self.max_steps, judged=judged,
+                             until=self.until)
         goal = Goal(**self._stamp(), rgb=self._goal_image(), intrinsics_px=self.world.intrinsics_px)
         self._place(present)
         return [Output(GOAL, goal), *self._outputs()]
@@ -66,7 +70,7 @@ class Simulator:
 
     @property
     def _done(self) -> bool:
-        return self.state.done or (self.goal_rgb is not None and self.state.declared)
+        return self.state.done
 
     def _stamp(self) -> dict[str, str | int]:
         return {"run": self._run, "episode": self._episode, "step": self.state.step}
@@ -99,7 +103,7 @@ class Simulator:
         return Truth(**self._stamp(), scene=scene.id, target=scene.target, names=[p.name for p in present],
                      centers_m=state.spheres.centers_m, yaws_rad=yaws, keep_out_m=state.spheres.radii_m,
                      target_center_m=scene.target_placed.center_m, world_from_camera=state.camera,
-                     goal_world_from_camera=state.goal, success=state.success, done=self._done,
+                     goal_world_from_camera=state.goal, success=state.reached, done=self._done,
                      declared=state.declared, declared_true=state.declared_true)
 
 
@@ -160,5 +164,5 @@ def build(config: Config) -> Simulator:
     goal_rgb = read_goal_image(scene.goal_image) if scene.goal_image is not None else None
     meshes = tuple(load_mesh(scene.objects, name) for name in names_in_use(scene))
     scenes = scenes_of(config, {mesh.name: mesh.size_m for mesh in meshes})
-    return Simulator(World(meshes), scenes, max_steps=config.simulator.max_steps,
+    return Simulator(World(meshes), scenes, max_steps=config.simulator.max_steps, until=config.simulator.until,
                      publish_depth=config.simulator.publish_depth, goal_rgb=goal_rgb, explore=scene.explore)
