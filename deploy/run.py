@@ -90,7 +90,7 @@ def _new_folder(folder: Path) -> Path:
 
 
 def _ending(config: Config, results: list[Result], progress: Progress) -> list[str]:
-    lines = [_result_line(config, result) for result in results]
+    lines = [_result_line(config, result) for result in results] + _doubts(config, progress)
     if config.scene.explore:
         found = [belief for _, belief in sorted(progress.beliefs.items()) if belief.presence > 0.5]
         for belief in found:
@@ -99,6 +99,20 @@ def _ending(config: Config, results: list[Result], progress: Progress) -> list[s
     elif len(results) > 1 and config.scene.goal_image is None:
         lines.append(f"reached {sum(r.success for r in results)} of {len(results)} goals")
     return lines
+
+
+def _doubts(config: Config, progress: Progress) -> list[str]:
+    """What the agent itself says, after the last episode, of why there was nothing to reach."""
+    plan = progress.plan
+    if plan is None or config.scene.explore:
+        return []
+    if not plan.target:
+        return [f"the goal image shows none of the known objects (confidence {plan.goal_confidence:.2f}): the agent "
+                "explored instead"]
+    target = progress.beliefs.get(plan.target)
+    if target is not None and target.presence < 0.5:
+        return [f"{plan.target} was not found: believed not to be there (presence {target.presence:.2f})"]
+    return []
 
 
 def _result_line(config: Config, result: Result) -> str:

@@ -17,6 +17,7 @@ ACROSS_STD_M, ALONG_SHARE = 0.012, 0.06  # of one percept, as perception is on a
 FARTHEST_M = 1.2  # beyond it nothing is recognised
 HALF_VIEW_TANGENT = 0.85 * IMAGE_SIZE_PX / 2 / INTRINSICS_PX[0]
 PARTICLES = 160
+DOUBT = 0.1  # an object believed absent is still worth so much of a look
 
 
 @dataclass(frozen=True)
@@ -96,7 +97,7 @@ def information_gain(eyes: Array, look_at: Array, belief: Belief) -> Array:
     found = 0.9 * share
     # finding it shrinks the cloud to one percept; not finding it removes the share that was looked at
     shrink = 0.5 * np.linalg.slogdet(belief.covariance_m2 / np.diag([0.02, 0.02, 0.03]).max() ** 2)[1]
-    return belief.presence * (found * max(shrink, 0.0) - (1 - found) * np.log(np.maximum(1 - found, 1e-3)))
+    return max(belief.presence, DOUBT) * (found * max(shrink, 0.0) - (1 - found) * np.log(np.maximum(1 - found, 1e-3)))
 
 
 def _in_view(eyes: Array, forward: Array, points: Array) -> NDArray[np.bool_]:

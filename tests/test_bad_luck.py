@@ -1,0 +1,129 @@
+"""Whole episodes of the shipped pantry agent in one process: ordinary luck and bad luck."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from deploy.registry import agent_pairs
+from services.evaluator import core as evaluator
+from services.simulator.core import SERVICE, Simulator
+from services.simulator.objects import load_mesh, names_of
+from services.simulator.scenes import Placed, generate_split
+from services.simulator.world import World
+from shared.config import Config
+from shared.geometry import look_at
+from shared.loop import run_local
+from shared.task import START_RANGE_M, start_pose
+
+NAMES = names_of("pantry")
+CONFIG = Config().with_values({"scene.names": list(NAMES), "scene.objects": "pantry", "bus.kind": "local"})
+
+
+@pytest.fixture(scope="module")
+def agent():
+    """The agent's services without its source, once for all episodes."""
+    return [*agent_pairs("sceneccn", CONFIG), (evaluator.SERVICE, evaluator.build(CONFIG))]
+
+
+@pytest.fixture(scope="module")
+def world():
+    world = World(tuple(load_mesh("pantry", name) for name in NAMES))
+    yield world
+    world.close()
+
+
+@pytest.fixture(scope="module")
+def scenes():
+    sizes = {name: load_mesh("pantry", name).size_m for name in NAMES}
+    return generate_split(sizes, seed=500, counts=(1, 3), repeats=1, yaw="random")
+
+
+def play(agent, world, scene, **options):
+    """Every message of one episode, by topic, in order."""
+    told = {}
+    source = (SERVICE, Simulator(world, [scene], **options))
+    run_local([source, *agent], NAMES, "test",
+              on_message=lambda topic, part, message, _: told.setdefault(topic.name, []).append((part, message)))
+    return told
+
+
+def last(told, topic):
+    return told[topic][-1][1]
+
+
+def test_the_agent_reaches_most_goals(agent, world, scenes):
+    """Ten ordinary scenes with turned objects, 120 steps each: at least eight are solved."""
+    results = [last(play(agent, world, scene, max_steps=120), "result") for scene in scenes]
+    assert sum(result.success for result in results) >= 8
+
+
+def test_it_says_itself_that_it_is_there(agent, world, scenes):
+    """Ended by the agent's own word: most declarations are true."""
+    results = [last(play(agent, world, scene, max_steps=60, until="declared"), "result") for scene in scenes]
+    declared = [result for result in results if result.declared]
+    assert len(declared) >= 6
+    assert sum(result.declared_true for result in declared) >= 0.75 * len(declared)
+
+
+def test_a_target_hidden_at_the_start_is_found(agent, world, scenes):
+    """The soup can stands behind the cereal box as seen from the start: not seen in the first frame, found later."""
+    toward = -start_pose()[:2, 3] / np.linalg.norm(start_pose()[:2, 3])
+    can, box = np.array([*(0.16 * toward), 0.051]), np.array([*(-0.02 * toward), 0.1065])
+    goal = look_at(can + np.array([-0.2, 0.15, 0.2]), can)
+    scene = replace(scenes[0], id="hidden", target="soup_can", goal_world_from_camera=goal,
+                    objects=(Placed("soup_can", can, 0.3), Placed("cereal_box", box, 0.0)))
+    told = play(agent, world, scene, max_steps=150)
+    first = next(m for part, m in told["percept"] if part == "soup_can")
+    belief = [m for part, m in told["belief"] if part == "soup_can"][-1]
+    assert START_RANGE_M == 0.65
+    assert first.presence < 0.5
+    assert np.linalg.norm(belief.mean_m - can) < 0.05
+
+
+def test_an_absent_target_is_never_declared(agent, world, scenes):
+    """The goal shows an object that is not on the table: the agent keeps looking, and ends up not believing in it."""
+    scene = next(s for s in scenes if s.target == "coffee_can" and len(s.objects) == 3)
+    told = play(agent, world, replace(scene, target_absent=True), max_steps=60)
+    belief = [m for part, m in told["belief"] if part == "coffee_can"][-1]
+    assert not any(plan.arrived for _, plan in told["plan"])
+    assert belief.presence < 0.5
+    eyes = np.array([m.world_from_camera[:3, 3] for _, m in told["frame"]])
+    assert np.linalg.norm(eyes.max(0) - eyes.min(0)) > 0.3
+
+
+@pytest.mark.parametrize("image", ["black", "white", "noise", "stripes"])
+def test_a_goal_image_of_nothing_known_gives_low_confidence_and_no_arrival(agent, world, scenes, image):
+    """What the image shows is no known object: the agent says so by its confidence, explores, and does not crash."""
+    rng = np.random.default_rng(0)
+    picture = {"black": np.zeros((480, 480, 3), np.uint8), "white": np.full((480, 480, 3), 255, np.uint8),
+               "noise": rng.integers(0, 256, (480, 480, 3), dtype=np.uint8),
+               "stripes": np.repeat(rng.integers(0, 256, (24, 1, 3), dtype=np.uint8), 20, 0).repeat(480, 1)}[image]
+    told = play(agent, world, scenes[0], max_steps=12, goal_rgb=picture)
+    assert last(told, "plan").goal_confidence < 0.2
+    assert last(told, "plan").target == ""
+    assert not last(told, "result").declared
+
+
+def test_exploring_finds_what_is_there(agent, world, scenes):
+    """Without a goal: after 60 steps the objects of the scene are believed within 4 cm of the truth."""
+    scene = next(s for s in scenes if len(s.objects) == 3)
+    told = play(agent, world, scene, max_steps=60, explore=True)
+    for placed in scene.objects:
+        belief = [m for part, m in told["belief"] if part == placed.name][-1]
+        assert belief.presence > 0.5, placed.name
+        assert np.linalg.norm(belief.mean_m - placed.center_m) < 0.04, placed.name
+
+
+def test_free_energy_falls_as_beliefs_sharpen(agent, world, scenes):
+    """What images say beyond what was believed (F less the likelihood, which is the image's own), summed over objects
+    and averaged over scenes: the end of the episodes is well below their start."""
+    firsts, lasts = [], []
+    for scene in [s for s in scenes if len(s.objects) == 3]:
+        told = play(agent, world, scene, max_steps=30, explore=True)
+        by_step = {}
+        for _, m in told["belief"]:
+            by_step[m.step] = by_step.get(m.step, 0.0) + m.free_energy - m.f_likelihood
+        firsts.append(np.mean([by_step[s] for s in range(3)]))
+        lasts.append(np.mean([by_step[s] for s in range(20, 30)]))
+    assert np.mean(lasts) < 0.6 * np.mean(firsts)
