@@ -7,7 +7,8 @@ import ctypes.util
 import numpy as np
 import pytest
 
-from services.simulator.objects import Mesh, load_mesh, names_of, ycb_folder
+from services.simulator.mesh import Mesh
+from services.simulator.objects import load_mesh, names_of, ycb_folder
 from services.simulator.opengl import choose_backend
 from services.simulator.world import FAR_M, World
 from shared.errors import SaccadeError

@@ -1,4 +1,4 @@
-"""Object sets: where their meshes come from, and their measures in metres.
+"""Object sets: where their meshes come from.
 
 `pantry` is made by code (`pantry.py`); `ycb` is read from the folder in SACCADE_YCB or the user's cache.
 """
@@ -6,36 +6,13 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
-
+from services.simulator.mesh import Mesh, read_obj
+from services.simulator.pantry import PANTRY_NAMES, make_mesh
 from shared.errors import SaccadeError
 
 YCB_NAMES = ("002_master_chef_can", "003_cracker_box", "004_sugar_box", "005_tomato_soup_can", "006_mustard_bottle")
-TEXTURE_MAX_PX = 2048  # beyond this a texel is far smaller than a pixel of the nearest view
-
-
-@dataclass(frozen=True)
-class Mesh:
-    """A textured triangle mesh, its box centre at the origin.
-
-    vertices_m [V, 3], texture coordinates [V, 2] (v up), faces [F, 3], texture [H, W, 3] uint8.
-    """
-
-    name: str
-    vertices_m: NDArray[np.float32]
-    texcoords: NDArray[np.float32]
-    faces: NDArray[np.int32]
-    texture: NDArray[np.uint8]
-
-    @property
-    def size_m(self) -> NDArray[np.float64]:
-        """Extents [3] of the axis-aligned box."""
-        return np.asarray(self.vertices_m.max(0) - self.vertices_m.min(0), dtype=np.float64)
 
 
 def ycb_folder() -> Path:
@@ -49,8 +26,6 @@ def names_of(object_set: str) -> tuple[str, ...]:
     if object_set == "ycb":
         return YCB_NAMES
     if object_set == "pantry":
-        from services.simulator.pantry import PANTRY_NAMES
-
         return PANTRY_NAMES
     raise SaccadeError(f"object set {object_set!r} is unknown: choose pantry or ycb")
 
@@ -61,48 +36,4 @@ def load_mesh(object_set: str, name: str) -> Mesh:
         raise SaccadeError(f"object {name!r} is not in {object_set!r}: choose from {', '.join(names_of(object_set))}")
     if object_set == "ycb":
         return read_obj(ycb_folder() / name, name)
-    from services.simulator.pantry import make_mesh
-
     return make_mesh(name)
-
-
-def read_obj(folder: Path, name: str) -> Mesh:
-    """Reads `textured.obj` and `texture_map.jpg|png` of a folder; raises SaccadeError with the path and what to do."""
-    path = folder / "textured.obj"
-    if not path.is_file():
-        raise SaccadeError(f"mesh {path} is missing: set SACCADE_YCB to a folder with {name}/textured.obj in it")
-    try:
-        vertices, texcoords, faces = _parse_obj(path.read_text().splitlines())
-    except (ValueError, IndexError, UnicodeDecodeError) as error:
-        raise SaccadeError(f"mesh {path} is damaged ({error}): fetch it again") from error
-    vertices -= (vertices.max(0) + vertices.min(0)) / 2
-    return Mesh(name, vertices, texcoords, faces, read_texture(folder))
-
-
-def _parse_obj(lines: list[str]) -> tuple[NDArray, NDArray, NDArray]:
-    """Wavefront OBJ triangles with texture coordinates; one output vertex per distinct (vertex, texcoord) pair."""
-    positions = np.array([line.split()[1:4] for line in lines if line.startswith("v ")], dtype=np.float32)
-    coords = np.array([line.split()[1:3] for line in lines if line.startswith("vt ")], dtype=np.float32)
-    corners = np.array([[c.split("/")[:2] for c in line.split()[1:]] for line in lines if line.startswith("f ")],
-                       dtype=np.int64) - 1
-    if corners.ndim != 3 or corners.shape[1:] != (3, 2) or len(positions) == 0:
-        raise ValueError("no textured triangles in it")
-    if corners.min() < 0 or corners[..., 0].max() >= len(positions) or corners[..., 1].max() >= len(coords):
-        raise ValueError("a face refers to a vertex that is not there")
-    if not (np.isfinite(positions).all() and np.isfinite(coords).all()):
-        raise ValueError("a coordinate is not finite")
-    pairs, inverse = np.unique(corners.reshape(-1, 2), axis=0, return_inverse=True)
-    return positions[pairs[:, 0]], coords[pairs[:, 1]], inverse.reshape(-1, 3).astype(np.int32)
-
-
-def read_texture(folder: Path) -> NDArray[np.uint8]:
-    """The texture [H, W, 3] beside a mesh, PNG or JPEG, at most TEXTURE_MAX_PX wide."""
-    for path in (folder / "texture_map.png", folder / "texture_map.jpg", folder / "texture_map.jpeg"):
-        if path.is_file():
-            try:
-                image = Image.open(path).convert("RGB")
-            except (UnidentifiedImageError, OSError, Image.DecompressionBombError) as error:
-                raise SaccadeError(f"texture {path} is damaged ({error}): fetch it again") from error
-            image.thumbnail((TEXTURE_MAX_PX, TEXTURE_MAX_PX), Image.Resampling.BOX)
-            return np.asarray(image)
-    raise SaccadeError(f"texture {folder / 'texture_map.png'} (or .jpg) is missing: fetch the object again")

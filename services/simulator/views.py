@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.simulator.objects import Mesh
+from services.simulator.mesh import Mesh
 from services.simulator.world import World
 from shared.geometry import REFERENCE_RANGE_M, direction, fibonacci_hemisphere, look_at
 

@@ -7,7 +7,7 @@ import weakref
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from services.simulator.objects import Mesh
+from services.simulator.mesh import Mesh
 from services.simulator.opengl import HOW_TO_MEND, choose_backend
 from shared.errors import SaccadeError
 from shared.geometry import IMAGE_SIZE_PX, INTRINSICS_PX
