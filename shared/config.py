@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from shared.errors import SaccadeError
 
 REPOSITORY = Path(__file__).resolve().parent.parent
+PRESETS = REPOSITORY / "deploy" / "presets"
 
 
 class Section(BaseModel):
@@ -50,10 +51,10 @@ class SimulatorConfig(Section):
 
 
 class PerceptionConfig(Section):
-    """`weights`: a folder with a manifest; the object set's own where absent."""
+    """`weights`: a folder with a manifest; the object set's own, of that architecture, where absent."""
 
     weights: Path | None = None
-    present_above: float = Field(0.6, ge=0, le=1)
+    architecture: Literal["default", "paper"] = "default"
     passes: int = Field(2, ge=1, le=4)  # crops are corrected and cut again
 
 
@@ -63,6 +64,11 @@ class BeliefConfig(Section):
     particles: int = Field(10_000, ge=100, le=1_000_000)
     jitter_m: float = Field(0.002, gt=0)
     present_above: float = Field(0.6, ge=0, le=1)
+    covariance: Literal["calibrated", "paper"] = "calibrated"  # of a percept: as the network is sure, or fixed
+    hidden: Literal["outlines", "nearest"] = "outlines"  # not looked for: behind an object's outline, or its range
+    pose: Literal["fused", "last"] = "fused"  # views that the goal's direction is inferred from
+    born: float = Field(0.02, ge=0, lt=1)  # prior that an object is where it is seen and not where it was believed
+    resample_below: float = Field(0.5, gt=0, le=1)  # effective share of particles
     missed_weight: float = Field(0.3, gt=0, le=1)
     published_particles: int = Field(512, ge=16)
     keyframes: int = Field(24, ge=1)
@@ -78,6 +84,8 @@ class PlannerConfig(Section):
     step_m: float = Field(0.05, gt=0, le=0.5)
     range_std_m: float = Field(0.025, gt=0)
     goal_confidence: float = Field(0.2, ge=0, le=1)  # below it the goal image says nothing
+    goal_pixel: bool = True  # the target is brought to where the goal image shows it, not to the centre
+    retry: bool = True  # a view that was not the goal's is left for another
     information_weight: float = Field(1.0, ge=0)
 
 
@@ -95,7 +103,8 @@ class Config(Section):
     @property
     def weights(self) -> Path:
         """The folder of the weights in use."""
-        return self.perception.weights or REPOSITORY / "weights" / self.scene.objects
+        suffix = "" if self.perception.architecture == "default" else f"-{self.perception.architecture}"
+        return self.perception.weights or REPOSITORY / "weights" / f"{self.scene.objects}{suffix}"
 
     def with_values(self, values: dict[str, Any]) -> Config:
         """A copy with dotted keys replaced (`{"scene.yaw": "fixed"}`). Raises SaccadeError for an unknown key."""
@@ -126,9 +135,11 @@ def validate(tree: dict[str, Any], where: str) -> Config:
 
 
 def load(path: Path | None) -> Config:
-    """Reads TOML or JSON; the default where no path is given."""
-    if path is None:
+    """Reads TOML or JSON, or a preset by its name (`default`, `paper`); the default where no path is given."""
+    if path is None or str(path) == "default":
         return Config()
+    if (PRESETS / f"{path}.toml").is_file():
+        path = PRESETS / f"{path}.toml"
     try:
         text = path.read_text()
         tree = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)

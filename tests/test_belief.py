@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from services.belief.pose import GoalView
-from services.belief.position import PositionFilter, behind, evidence_of
+from services.belief.position import PositionFilter, behind, beyond_nearest, evidence_of
 from shared.config import BeliefConfig
 from shared.generative_model import LATENT
 from shared.geometry import INTRINSICS_PX, direction, look_at, project, spherical, viewing_grid
@@ -80,6 +80,27 @@ def test_what_another_object_hides_keeps_its_weight():
     box = evidence_of(percept(camera, np.array([0.2, 0.0, 0.1])))
     points = np.array([[-0.1, 0.0, 0.1], [0.35, 0.0, 0.1], [-0.1, 0.3, 0.1]])
     assert behind(points, camera[:3, 3], [(box, 0.1)]).tolist() == [True, False, False]
+
+
+def test_the_papers_cut_off_is_the_nearest_objects_range():
+    """As written in the paper: whatever is farther than the nearest object seen is not looked for, hidden or not."""
+    camera = look_at((0.5, 0.0, 0.1), (0.0, 0.0, 0.1))
+    box = evidence_of(percept(camera, np.array([0.2, 0.0, 0.1])))
+    points = np.array([[-0.1, 0.0, 0.1], [0.35, 0.0, 0.1], [-0.1, 0.3, 0.1]])
+    assert beyond_nearest(points, camera[:3, 3], [(box, 0.1)]).tolist() == [True, False, True]
+
+
+def test_the_papers_covariance_is_fixed():
+    covariance = evidence_of(percept(start_pose(), std=0.01), "paper").covariance
+    assert np.linalg.eigvalsh(covariance) == pytest.approx([0.020, 0.020, 0.0969])
+
+
+def test_the_last_view_alone_forgets_the_others():
+    seen = GoalView(BeliefConfig(pose="last"), Turning(1), percept(start_pose(), latent=latent_of(1.0, 0.5)))
+    for camera in cameras():
+        seen.seen(percept(camera, latent=latent_of(0.3, 0.7)), TRUE)
+    assert len(seen.keyframes) == 1
+    assert np.allclose(seen.keyframes[0].eye, cameras()[-1][:3, 3])
 
 
 def test_a_lost_object_is_found_again():

@@ -70,6 +70,8 @@ class GoalView:
             self.center = np.array(center)
             for keyframe in self.keyframes:
                 keyframe.log_likelihood = self._likelihood(keyframe.eye, keyframe.mean)
+        if self.config.pose == "last":
+            self.keyframes = []
         eye = percept.world_from_camera[:3, 3]
         quality = percept.presence / (0.03 + percept.log_scale_std)
         near = [k for k in self.keyframes if _angle(k.eye, eye, self.center) < NEW_VIEW_RAD]
@@ -128,6 +130,8 @@ class GoalView:
 
     def range_m(self, log_posterior: Array) -> float:
         """The goal's range: as measured, corrected by what the same networks get wrong on views from about there."""
+        if self.config.pose == "last":
+            return self.measured_range_m
         weights = self._nearness(log_posterior)
         ratios = np.log([np.linalg.norm(k.eye - self.center) / k.range_m for k in self.keyframes])
         return float(self.measured_range_m * np.exp(weights @ ratios / (weights.sum() + SAME_SCALE)))

@@ -19,10 +19,11 @@ Array = NDArray[np.float64]
 WORKSPACE_M = np.array([[-0.5, 0.5], [-0.5, 0.5], [0.0, 0.5]])
 VOLUME_M3 = float(np.prod(WORKSPACE_M[:, 1] - WORKSPACE_M[:, 0]))
 MODEL_STD_M = 0.006  # what no network can know: the box's centre against what is seen of it
+PAPER_ACROSS_M2, PAPER_ALONG_M2 = 0.020, 0.0969  # appendix D, as the published code has them
 CORRELATION = 2.0  # successive views err alike: their deviations count this much larger
 OUTLIER = 0.05  # share of percepts that are of something else, anywhere in the workspace
-BORN, BORN_VAGUE = 0.02, 0.7  # prior that the object is where it is now seen and not where it was believed to be:
-VAGUE_M = 0.12  # little, unless the cloud is wider than this and so says next to nothing
+FRESH_SHARE = 0.05  # of the particles are drawn anew from each percept, at least
+BORN_VAGUE, VAGUE_M = 0.7, 0.12  # a cloud wider than this says next to nothing: most are drawn anew
 MARGIN_PX = 30  # an object this near to the image's border need not be seen
 
 
@@ -36,16 +37,19 @@ class Evidence:
     direction: Array
 
 
-def evidence_of(percept: Percept) -> Evidence:
-    """The Gaussian along the ray: sharp across it, as wide along it as the scale is uncertain."""
+def evidence_of(percept: Percept, covariance: str = "calibrated") -> Evidence:
+    """The Gaussian along the ray: sharp across it, as wide along it as the scale is uncertain; or of the paper's fixed
+    covariance."""
     camera = percept.world_from_camera
     ray = camera[:3, :3] @ pixel_rays(percept.pixel, percept.intrinsics_px)
     range_m = REFERENCE_RANGE_M / percept.scale
     across = CORRELATION * np.hypot(percept.pixel_std / percept.intrinsics_px[0] * range_m, MODEL_STD_M)
     along = CORRELATION * np.hypot(percept.log_scale_std * range_m, MODEL_STD_M)
+    if covariance == "paper":
+        across, along = np.sqrt(PAPER_ACROSS_M2), np.sqrt(PAPER_ALONG_M2)
     outer = np.outer(ray, ray)
-    covariance = across ** 2 * (np.eye(3) - outer) + along ** 2 * outer
-    return Evidence(camera[:3, 3] + range_m * ray, covariance, range_m, ray)
+    spread = across ** 2 * (np.eye(3) - outer) + along ** 2 * outer
+    return Evidence(camera[:3, 3] + range_m * ray, spread, range_m, ray)
 
 
 @contextmanager
@@ -76,16 +80,19 @@ class PositionFilter:
     def seen(self, percept: Percept, rng: np.random.Generator) -> None:
         """Positive evidence: particles gain by their density under the percept's Gaussian; some are drawn from it, so
         that a lost object is found again, by two percepts that agree and not by a single wrong one."""
-        evidence = evidence_of(percept)
+        evidence = evidence_of(percept, self.config.covariance)
         factor = np.linalg.cholesky(evidence.covariance)
-        born = BORN_VAGUE if np.trace(self.moments()[1]) > VAGUE_M ** 2 else BORN
-        fresh = rng.permutation(len(self.particles))[:int(max(born, 0.05) * len(self.particles))]
+        born = self.config.born
+        if born and np.trace(self.moments()[1]) > VAGUE_M ** 2:
+            born = BORN_VAGUE
+        share = max(born, FRESH_SHARE) if born else 0.0
+        fresh = rng.permutation(len(self.particles))[:int(share * len(self.particles))]
         drawn = evidence.mean + rng.standard_normal((len(fresh), 3)) @ factor.T
         inside = ((drawn > WORKSPACE_M[:, 0]) & (drawn < WORKSPACE_M[:, 1])).all(1)
         self.particles[fresh] = np.where(inside[:, None], drawn, self.particles[fresh])
         likelihood = (1 - born) * (_density(self.particles, evidence, factor) + OUTLIER / VOLUME_M3)
         self.weights[fresh] = 1.0  # drawn from the percept itself, their share of the posterior is known:
-        likelihood[fresh] = np.where(inside, born / VOLUME_M3 / len(fresh), 0.0)
+        likelihood[fresh] = np.where(inside, born / VOLUME_M3 / max(len(fresh), 1), 0.0)
         self._reweigh(likelihood, rng)
         odds = percept.presence / max(1.0 - percept.presence, 1e-3)
         self.log_odds = min(self.log_odds + np.log(max(odds, 1e-3)), 8.0)
@@ -93,7 +100,8 @@ class PositionFilter:
     def missed(self, camera: Array, intrinsics_px: Array, seen: list[tuple[Evidence, float]],
                rng: np.random.Generator) -> None:
         """Negative evidence: particles in view, not behind an object that is `seen` (with its radius, m), lose."""
-        visible = in_view(self.particles, camera, intrinsics_px) & ~behind(self.particles, camera[:3, 3], seen)
+        hide = behind if self.config.hidden == "outlines" else beyond_nearest
+        visible = in_view(self.particles, camera, intrinsics_px) & ~hide(self.particles, camera[:3, 3], seen)
         share = float(self.weights[visible].sum())
         self._reweigh(np.where(visible, self.config.missed_weight, 1.0), rng)
         self.log_odds = max(self.log_odds + np.log(max(1.0 - share * (1.0 - self.config.missed_weight), 1e-3)), -8.0)
@@ -101,7 +109,7 @@ class PositionFilter:
     def _reweigh(self, factors: Array, rng: np.random.Generator) -> None:
         weights = self.weights * factors
         self.weights = weights / weights.sum()
-        if 1.0 / np.sum(self.weights ** 2) < len(weights) / 2:
+        if 1.0 / np.sum(self.weights ** 2) < self.config.resample_below * len(weights):
             with _global_state(rng):
                 chosen = systematic_resample(self.weights)
             noise = rng.normal(0.0, self.config.jitter_m, self.particles.shape)
@@ -143,3 +151,9 @@ def behind(points: Array, eye: Array, seen: list[tuple[Evidence, float]]) -> NDA
         widest = np.cos(np.arctan2(radius_m, evidence.range_m))
         hidden |= (cosine > widest) & (distance > evidence.range_m)
     return hidden
+
+
+def beyond_nearest(points: Array, eye: Array, seen: list[tuple[Evidence, float]]) -> NDArray[np.bool_]:
+    """Which points [N, 3] are farther from the eye [3] than the nearest object that is seen (the paper's cut-off)."""
+    nearest = min((evidence.range_m for evidence, _ in seen), default=np.inf)
+    return np.linalg.norm(points - eye, axis=1) > nearest

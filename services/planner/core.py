@@ -81,7 +81,7 @@ class Planner:
         arrived = self._arrived(camera)
         there = arrived and self.plan is not None and self.plan.mode == "goal"
         declared = there and beliefs[self.plan.target].goal_here > SURE
-        if there:
+        if there and self.config.planner.retry:
             self.visited.append(camera)
         self.age += 1
         mode = self._mode(beliefs)
@@ -210,6 +210,8 @@ class Planner:
     def _goal_viewpoint(self, target: Belief, eye: Array) -> Array:
         """The view from `eye` [3] that shows the target at the goal's pixel [4, 4]. As in the environment, the position
         is clipped (when the camera moves there) and the attitude is kept."""
+        if not self.config.planner.goal_pixel:
+            return look_at(eye, target.mean_m)
         return aim(eye, target.mean_m, self.preference.pixel, self.preference.intrinsics_px)
 
     def _plan(self, stamp: Belief, mode: str, gaze: Array, terms: Terms, chosen: int) -> Plan:
