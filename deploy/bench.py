@@ -33,6 +33,7 @@ from shared.messages import Result
 from shared.provenance import commit
 from shared.topics import RESULT
 
+SCENES_ENDING = ".scenes.json"  # of the file with the scenes that were drawn
 RUN = "bench"  # the same in every benchmark: it is in the messages
 MATTERS = ("agent", "objects", "config", "weights", "scenes")  # facts without which results do not belong together
 RECORD_KEYS = ("scene", "target", "objects", "success", "steps", "azimuth_error_rad", "elevation_error_rad",
@@ -71,7 +72,7 @@ def prepare(agent: str, config: Config, out: Path, *, suite: str | None = None, 
     path = config.scene.file
     if path is None:
         suite = suite or default_suite(config.scene.objects)
-        path = suite_file(suite, config, out.with_name(out.stem + ".scenes.json"))
+        path = suite_file(suite, config, out.with_name(out.stem + SCENES_ENDING))
     config = config.with_values({"scene.names": list(names), "scene.file": str(path.resolve()), "bus.kind": "local"})
     weight_hashes(agent, config)
     scenes = tuple(load_scenes(path, names))

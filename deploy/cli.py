@@ -83,6 +83,38 @@ def bench(*, objects: Objects = None, scenes: ScenesFile = None,
 
 
 @app.command()
+def report(*, results: Annotated[list[Path], typer.Argument(
+               metavar="RESULTS.json...", help="files of `saccade bench`")],
+           out: Annotated[Path, typer.Option(help="folder of the report")],
+           failures: Annotated[bool, typer.Option(
+               "--failures", help="also failures.md: every failed scene, run again, by its cause")] = False,
+           no_reruns: Annotated[bool, typer.Option(
+               "--no-reruns", help="only what the results alone tell: no episodes are run again")] = False,
+           weights: WeightsFolder = None,
+           jobs: Annotated[int, typer.Option(min=1, help="processes at a time, for --failures")] = 1) -> None:
+    """Write results as a page with tables and pictures: report.md."""
+    from rich.console import Console
+
+    from deploy.report import report as write_report
+
+    write_report(results, out, failures=failures, reruns=not no_reruns, weights=weights, jobs=jobs, console=Console())
+
+
+@app.command()
+def picture(log: Annotated[Path, typer.Argument(metavar="RUN", help="folder of a run, or its log")],
+            out: Annotated[Path | None, typer.Option(help="file [default: picture.png beside the log]")] = None,
+            episode: Annotated[int | None, typer.Option(min=0, help="which one [default: the last]")] = None) -> None:
+    """Draw the picture of a run from its log once more."""
+    from deploy.picture import draw
+    from deploy.run import LOG_NAME, PICTURE_NAME
+
+    file = log / LOG_NAME if log.is_dir() else log
+    target = out or file.with_name(PICTURE_NAME)
+    draw(file, target, episode)
+    print(f"written to {target}")
+
+
+@app.command()
 def train(*, objects: Objects = None, names: Names = None,
           out: Annotated[Path | None, typer.Option(
               help="folder of the training [default: training_runs/<set>]")] = None,
@@ -91,6 +123,8 @@ def train(*, objects: Objects = None, names: Names = None,
           views: Annotated[int | None, typer.Option(min=20, max=5000, help="views of each object")] = None,
           seed: Seed = None, jobs: Annotated[int, typer.Option(min=1, help="networks at a time")] = 1,
           device: Annotated[Literal["auto", "cpu", "cuda"] | None, typer.Option(help="[default: auto]")] = None,
+          architecture: Annotated[Literal["default", "paper"], typer.Option(
+              help="our networks, or those of the paper's tables; theirs go to folders named <set>-paper")] = "default",
           weights: WeightsFolder = None) -> None:
     """Train the networks of an object set; given again after an interruption, go on from there."""
     from rich.console import Console
@@ -103,10 +137,11 @@ def train(*, objects: Objects = None, names: Names = None,
 
     object_set = objects or "pantry"
     given = {"seed": seed, "steps_ccn": steps_ccn, "steps_extraction": steps_extraction, "views": views,
-             "device": device}
+             "device": device, "architecture": architecture}
     chosen = names_in_use(SceneConfig(objects=object_set, names=split_names(names)))
     settings = TrainingConfig(objects=object_set, names=chosen, **{k: v for k, v in given.items() if v is not None})
-    folder, target = out or Path("training_runs") / object_set, weights or REPOSITORY / "weights" / object_set
+    name = object_set if architecture == "default" else f"{object_set}-{architecture}"
+    folder, target = out or Path("training_runs") / name, weights or REPOSITORY / "weights" / name
     run_training(folder, settings, jobs=jobs, console=Console())
     export(folder, target)
     print(f"weights written to {target}")

@@ -125,22 +125,23 @@ def render(records: Sequence[Record], *, title: str) -> Table:
     """The table for the terminal: three lines a target, ours, its 95 % interval, and the paper's where it has one."""
     theirs = "paper" if any(r["target"] in PAPER for r in records) else "paper (YCB)"
     caption = "± is the standard error of the mean; 95 % intervals: Wilson for success, normal for means"
-    caption += "; median steps: interquartile range; rightly: of those declared; false alarms: of all"
+    caption += "; of the steps: interquartile range\ndeclared: the agent said that it was there; rightly: of those, "
+    caption += "false: of all scenes"
     if spent := milliseconds(records):
         caption += "\nmilliseconds per step: " + ", ".join(f"{name} {ms:.1f}" for name, ms in spent.items())
     table = Table(title=title, caption=caption, show_lines=True)
     for header in ("target", "", "n"):
         table.add_column(header)
-    for header in ("success (%)", *MEASURES.values(), "median steps", "declared", "rightly",
-                   "false alarms"):
+    for header in ("success (%)", *MEASURES.values(), "median steps", "declared"):
         table.add_column(header, justify="right")
     for row in rows(records):
         paper = PAPER.get(row.name)
         labels = "\n".join(["ours", "95 %", *([theirs] if paper else [])])
         rightly = "-" if row.declared_true is None else f"{100 * row.declared_true:.0f} %"
+        declared = f"{100 * row.declared:.0f} %\nrightly {rightly}\nfalse {100 * row.false_alarms:.0f} %"
         steps = f"{row.median_steps:g}\n{row.middle_steps[0]:g} to {row.middle_steps[1]:g}"
-        table.add_row(row.name, labels, str(row.scenes), *_cells(row, paper), steps, f"{100 * row.declared:.0f} %",
-                      rightly, f"{100 * row.false_alarms:.0f} %", style="bold" if row.name == TOTAL else "")
+        table.add_row(row.name, labels, str(row.scenes), *_cells(row, paper), steps, declared,
+                      style="bold" if row.name == TOTAL else "")
     return table
 
 

@@ -2,11 +2,13 @@
 
 A crop o is encoded into q(p | o), a Gaussian over the object's latent pose; p(p' | p, a) moves it by a displacement in
 azimuth and elevation; p(o | p) draws it. Perception encodes, belief and planner transition: so it lives here.
+There are two architectures: "paper" is the paper's tables to the letter, "default" is what departs from them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
@@ -16,6 +18,8 @@ from torch.func import functional_call, stack_module_state
 LATENT = 8
 CROP_PX = 64
 MIN_STD = 1e-3
+
+Architecture = Literal["default", "paper"]
 
 
 def conv_stack(channels_in: int, width: int) -> nn.Sequential:
@@ -34,7 +38,8 @@ def gaussian(parameters: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class Encoder(nn.Module):
-    """q(p | o): masked crop and its mask [B, 4, 64, 64] -> mean, std [B, L] (table 5; `width` 1 is the paper's)."""
+    """q(p | o): masked crop and its mask [B, 4, 64, 64] -> mean, std [B, L] (table 5; the paper's is of width 1 and
+    sees the masked crop alone)."""
 
     def __init__(self, width: int = 2, channels_in: int = 4):
         super().__init__()
@@ -48,19 +53,21 @@ class Encoder(nn.Module):
 class Transition(nn.Module):
     """p(p' | p, a): latent [B, L], displacement (azimuth, elevation) [B, 2] in radians -> mean, std [B, L] (table 7).
 
-    The azimuth enters as sine and cosine, so that a full turn is no turn.
+    The azimuth enters as sine and cosine, so that a full turn is no turn; or, not `periodic`, as it is (the paper's).
     """
 
-    def __init__(self):
+    def __init__(self, periodic: bool = True):
         super().__init__()
+        self.periodic = periodic
         self.layers = nn.Sequential(
-            nn.Linear(LATENT + 3, 128), nn.LeakyReLU(), nn.Linear(128, 256), nn.LeakyReLU(),
+            nn.Linear(LATENT + (3 if periodic else 2), 128), nn.LeakyReLU(), nn.Linear(128, 256), nn.LeakyReLU(),
             nn.Linear(256, 256), nn.LeakyReLU(), nn.Linear(256, 2 * LATENT))
 
     def forward(self, latent: Tensor, displacement: Tensor) -> tuple[Tensor, Tensor]:
-        azimuth, elevation = displacement[..., :1], displacement[..., 1:]
-        features = torch.cat([latent, azimuth.sin(), azimuth.cos(), elevation], dim=-1)
-        return gaussian(self.layers(features).float())
+        if self.periodic:
+            azimuth, elevation = displacement[..., :1], displacement[..., 1:]
+            displacement = torch.cat([azimuth.sin(), azimuth.cos(), elevation], dim=-1)
+        return gaussian(self.layers(torch.cat([latent, displacement], dim=-1)).float())
 
 
 class Decoder(nn.Module):
@@ -80,12 +87,45 @@ class Decoder(nn.Module):
         return self.convolutions(self.linear(latent).view(-1, 64, 8, 8))
 
 
-class CCN(nn.Module):
-    """Encoder, transition and decoder of one object."""
+class PaperDecoder(nn.Module):
+    """p(o | p) of the paper (table 6): latent [B, L] -> crop on black [B, 3, 64, 64]. No padding: 8 pixels become 4, 17
+    become 13, 35 become 30, 69 become 64."""
 
     def __init__(self):
         super().__init__()
-        self.encoder, self.transition, self.decoder = Encoder(), Transition(), Decoder()
+        self.linear = nn.Linear(LATENT, 64 * 8 * 8)
+        self.convolutions = nn.Sequential(
+            nn.Conv2d(64, 64, 5), nn.LeakyReLU(), nn.Upsample(17, mode="bilinear"),
+            nn.Conv2d(64, 64, 5), nn.LeakyReLU(), nn.Upsample(35, mode="bilinear"),
+            nn.Conv2d(64, 32, 6), nn.LeakyReLU(), nn.Upsample(69, mode="bilinear"),
+            nn.Conv2d(32, 16, 6), nn.LeakyReLU(), nn.Conv2d(16, 3, 1))
+
+    def forward(self, latent: Tensor) -> Tensor:
+        return self.convolutions(self.linear(latent).view(-1, 64, 8, 8))
+
+
+def encoder_of(architecture: Architecture) -> Encoder:
+    """An untrained q(p | o)."""
+    return Encoder(width=1, channels_in=3) if architecture == "paper" else Encoder()
+
+
+def transition_of(architecture: Architecture) -> Transition:
+    """An untrained p(p' | p, a)."""
+    return Transition(periodic=architecture == "default")
+
+
+def decoder_of(architecture: Architecture) -> Decoder | PaperDecoder:
+    """An untrained p(o | p)."""
+    return PaperDecoder() if architecture == "paper" else Decoder()
+
+
+class CCN(nn.Module):
+    """Encoder, transition and decoder of one object."""
+
+    def __init__(self, architecture: Architecture = "default"):
+        super().__init__()
+        self.encoder, self.transition = encoder_of(architecture), transition_of(architecture)
+        self.decoder = decoder_of(architecture)
 
 
 class Stacked:

@@ -1,7 +1,7 @@
 """Trained weights: a folder of safetensors in half precision with a manifest that is verified on loading.
 
-`manifest.json` says what the weights are (data, seed, steps, losses, commit, where trained), the measures of each
-object and the SHA-256 of every file.
+`manifest.json` says what the weights are (data, seed, steps, losses, commit, where trained), of which architecture (the
+default one where it says nothing), the measures of each object and the SHA-256 of every file.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import hashlib
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import torch
@@ -18,6 +19,7 @@ from safetensors.torch import load, save
 from torch import Tensor, nn
 
 from shared.errors import SaccadeError
+from shared.generative_model import Architecture
 
 MANIFEST = "manifest.json"
 MAX_FILE_BYTES = 64 * 1024 * 1024
@@ -50,9 +52,13 @@ class Weights:
             self.cards = tuple(ObjectCard(name, np.array(card["size_m"], dtype=np.float64), float(card["crop_side_m"]))
                                for name, card in self.manifest["objects"].items())
             self.hashes: dict[str, str] = dict(self.manifest["sha256"])
+            self.architecture: Architecture = self.manifest.get("architecture", "default")
             self.calibration: dict[str, float] = dict(self.manifest.get("calibration", {}))
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise SaccadeError(f"weights manifest {path} is damaged ({error}): get it again or train anew") from error
+        if self.architecture not in get_args(Architecture):
+            raise SaccadeError(f"weights manifest {path} names an unknown architecture {self.architecture!r}: "
+                               "get a newer version of the program, or train anew")
 
     @property
     def names(self) -> tuple[str, ...]:

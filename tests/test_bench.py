@@ -14,7 +14,8 @@ import deploy.bench as bench_module
 from deploy.bench import Plan, bench, prepare, run_scene, spread
 from deploy.launch import PROCESSES
 from deploy.registry import AGENTS, agent_pairs, agent_processes, local_pairs
-from deploy.table import PAPER, TOTAL, mean, render, rows, wilson
+from deploy.suites import suite_file
+from deploy.table import PAPER, TOTAL, mean, milliseconds, render, rows, wilson
 from services.simulator.scenes import PAPER_SCENES, load_scenes
 from shared.config import Config
 from shared.errors import SaccadeError
@@ -75,6 +76,16 @@ def test_rows_per_target_and_total():
     assert (mug.declared, mug.declared_true, can.declared_true) == (0.5, 1.0, 0.0)
     assert (total.name, total.scenes, total.success.value, total.median_steps) == (TOTAL, 3, pytest.approx(1 / 3), 350)
     assert (total.declared, total.declared_true) == (pytest.approx(2 / 3), 0.5)
+    assert (mug.false_alarms, can.false_alarms, total.false_alarms) == (0.0, 1.0, pytest.approx(1 / 3))
+    assert (mug.middle_steps, can.middle_steps) == ((95.0, 265.0), (350, 350))
+
+
+def test_milliseconds_are_means_over_all_steps():
+    """A longer episode counts for more; records without times, of an older file, count for nothing."""
+    spent = [record(steps=1, milliseconds={"belief": 10.0}), record(steps=3, milliseconds={"belief": 30.0}), record()]
+    assert milliseconds(spent) == {"belief": 25.0}
+    assert milliseconds([record()]) == {}
+    assert "milliseconds per step: belief 25.0" in text_of(render(spent, title="t"))
 
 
 def test_paper_figures_stand_beside_ours_and_say_what_they_are_of():
@@ -136,14 +147,17 @@ def test_oracle_solves_pantry_scenes(tmp_path):
     assert len({r["target"] for r in records}) == 5
     assert {"command", "commit", "weights", "machine", "config", "scenes", "agent", "objects"} <= written.keys()
     assert set(records[0]) == {"scene", "target", "objects", "success", "steps", "azimuth_error_rad", "seconds",
-                               "elevation_error_rad", "range_error_m", "declared", "declared_true"}
+                               "elevation_error_rad", "range_error_m", "declared", "declared_true", "milliseconds"}
+    assert all(r["milliseconds"].keys() == {"simulator", "oracle", "evaluator"} for r in records)
+    assert written["scenes"]["suite"] == "paper-like"
     assert list(tmp_path.glob("*.partial*")) == []
 
 
 def test_interrupted_run_is_taken_up_again_with_the_same_outcome(tmp_path, monkeypatch):
     """Stopped after two of five, with half a line written: the rest alone is run, and the file is as without it."""
-    whole, plan = tmp_path / "whole.json", prepare("oracle", Config(), tmp_path / "o.json", limit=5)
-    run_bench(prepare("oracle", Config(scene={"file": plan.config.scene.file}), whole, limit=5), jobs=2)
+    drawn = Config(scene={"file": suite_file("paper-like", Config(), tmp_path / "scenes.json")})
+    whole, plan = tmp_path / "whole.json", prepare("oracle", drawn, tmp_path / "o.json", limit=5)
+    run_bench(prepare("oracle", drawn, whole, limit=5), jobs=2)
     records, asked = bench_module._records, []
 
     def stop_after_two(plan, numbers, jobs):
@@ -211,7 +225,7 @@ def test_a_scene_is_the_same_alone_as_in_a_run_of_the_whole_file(tmp_path):
         elif topic == ACTION:
             actions[message.episode].append(message.translation_m.tolist())
 
-    run_local(local_pairs("sceneccn", plan.config), names, "bench", episodes=2, on_message=hear)
+    run_local(local_pairs("sceneccn", plan.config), names, "bench", range(2), hear)
     alone = run_scene("sceneccn", plan.config.model_dump_json(), 1)
     whole = {key: getattr(results[1], key) for key in bench_module.RECORD_KEYS}
     assert timeless([alone]) == [whole]

@@ -81,7 +81,7 @@ def small(weights, **values) -> Config:
 def test_help_lists_the_commands(monkeypatch, capsys):
     code, out, _ = call(monkeypatch, capsys, "--help")
     assert code == 0
-    for command in ("run", "bench", "train", "doctor", "topics"):
+    for command in ("run", "bench", "report", "picture", "train", "doctor", "topics"):
         assert f" {command} " in out
 
 
@@ -113,6 +113,12 @@ def test_topics_lists_the_registry(monkeypatch, capsys):
     (("run", "--agent", "oracle", "--bus", "local", "--goal", "none.png"), "goal image"),
     (("bench", "--agent", "oracle", "--scenes", PAPER_SCENES), "is not in use: choose the set that has it"),
     (("bench", "--agent", "oracle", "--scenes", PAPER_SCENES, "--yaw", "random"), "--yaw is for scenes that are drawn"),
+    (("bench", "--agent", "oracle", "--suite", "dev", "--yaw", "random"), "--yaw is for scenes that are drawn"),
+    (("bench", "--agent", "oracle", "--suite", "dev", "--scenes", "s.json"), "leave --scenes or --suite out"),
+    (("bench", "--agent", "oracle", "--suite", "all"), "suite 'all' is unknown: choose from paper-500, yaw-500"),
+    (("bench", "--agent", "oracle", "--suite", "paper-500"), "is of the objects 'ycb': add `--objects ycb`"),
+    (("report", "none.json", "--out", "r"), "results none.json cannot be read"),
+    (("picture", "none.mcap"), "none.mcap cannot be read"),
     (("train", "--names", "teapot"), "'teapot' is not in 'pantry'"),
 ])
 def test_what_the_user_can_mend_is_one_line_and_code_2(monkeypatch, capsys, tmp_path, arguments, words):

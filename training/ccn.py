@@ -47,8 +47,13 @@ def squared_error(image: Tensor, target: Tensor, weight: Tensor) -> Tensor:
     return (per_crop * weight).sum() / weight.sum().clamp(min=1.0)
 
 
-def loss_l1(ccn: CCN, pair: Pair, lambdas: list[float], generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
-    """Loss L1 (equation 4), with o_2 compared to a decoding of its own latent (the paper's o_1 there is a slip)."""
+def loss_l1(ccn: CCN, pair: Pair, lambdas: list[float], generator: torch.Generator, *,
+            kl_transition: float = KL_TRANSITION, halves: bool = True) -> tuple[Tensor, dict[str, float]]:
+    """Loss L1 (equation 4), with o_2 compared to a decoding of its own latent (the paper's o_1 there is a slip).
+
+    `halves`: in the terms before the transition half of the batch stands for o_1 and half for o_2; as the pairs are
+    symmetric, that saves a third of the decodings.
+    """
     both = torch.cat([pair.first.masked, pair.second.masked]).contiguous(memory_format=torch.channels_last)
     mean, std = ccn.encoder(both)
     noise = torch.randn(mean.shape, generator=generator, device=mean.device)
@@ -56,17 +61,17 @@ def loss_l1(ccn: CCN, pair: Pair, lambdas: list[float], generator: torch.Generat
     half = len(mean) // 2
     moved_mean, moved_std = ccn.transition(sample[:half], pair.displacement)
     noise = torch.randn(moved_mean.shape, generator=generator, device=mean.device)
-    # half of the batch stands for o_1 and half for o_2 in the terms before the transition: the pairs are symmetric
-    quarter = half // 2
-    drawn = ccn.decoder(torch.cat([sample[:quarter], sample[half + quarter:], moved_mean + moved_std * noise]))
+    end, begin = (half // 2, half // 2) if halves else (half, 0)
+    drawn = ccn.decoder(torch.cat([sample[:end], sample[half + begin:], moved_mean + moved_std * noise]))
+    first, second, moved = drawn.split([end, half - begin, half])
     seen_1, seen_2 = (pair.first.visible > 0.3).float(), (pair.second.visible > 0.3).float()
-    errors = [squared_error(drawn[:quarter], pair.first.target[:quarter], seen_1[:quarter]),
-              squared_error(drawn[quarter:half], pair.second.target[quarter:], seen_2[quarter:]),
-              squared_error(drawn[half:], pair.second.target, seen_1 * seen_2)]
+    errors = [squared_error(first, pair.first.target[:end], seen_1[:end]),
+              squared_error(second, pair.second.target[begin:], seen_2[begin:]),
+              squared_error(moved, pair.second.target, seen_1 * seen_2)]
     kl_move = (kl_divergence(mean[half:], std[half:], moved_mean, moved_std) * seen_1 * seen_2).mean()
     kl_prior = (kl_divergence(mean, std, 0.0, 1.0).mean() + kl_divergence(moved_mean, moved_std, 0.0, 1.0).mean())
     loss = sum(weight * (error - TOLERANCE) for weight, error in zip(lambdas, errors, strict=True))
-    loss = loss + KL_TRANSITION * kl_move + KL_PRIOR * kl_prior
+    loss = loss + kl_transition * kl_move + KL_PRIOR * kl_prior
     parts = dict(zip(("first", "second", "moved"), (float(e.detach()) for e in errors), strict=True))
     return loss, {**parts, "kl": float(kl_move.detach())}
 

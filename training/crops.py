@@ -119,12 +119,12 @@ def _half_tiles(views: ObjectViews) -> Tensor:
     return torch.stack(halves).view(shells, count, 4, CROP_PX, CROP_PX)
 
 
-def warp(tiles: Tensor, center: Tensor, scale: Tensor, roll: Tensor) -> Tensor:
+def warp(tiles: Tensor, center: Tensor, scale: Tensor, roll: Tensor, side_px: int = CROP_PX) -> Tensor:
     """Tiles [B, C, h, w] drawn on a crop: centre [B, 2] in half crop sides, scale [B] in crop sides, roll [B]."""
     cos, sin = roll.cos() / scale, roll.sin() / scale
     rows = torch.stack([torch.stack([cos, sin], -1), torch.stack([-sin, cos], -1)], dim=1)
     theta = torch.cat([rows, -rows @ center[:, :, None]], dim=2)
-    grid = F.affine_grid(theta, [len(tiles), tiles.shape[1], CROP_PX, CROP_PX], align_corners=False)
+    grid = F.affine_grid(theta, [len(tiles), tiles.shape[1], side_px, side_px], align_corners=False)
     return F.grid_sample(tiles, grid, align_corners=False)
 
 

@@ -38,12 +38,16 @@ def loss_l2(network: Extraction, batch: FrameBatch) -> tuple[Tensor, dict[str, f
 
 @torch.inference_mode()
 def extraction_errors(network: Extraction, batch: FrameBatch) -> dict[str, float]:
-    """Median and 90th percentile of centre (pixels of 480) and scale (log) errors, and of presence: its accuracy."""
+    """The errors of the network's votes: see `errors`."""
     _, vote_logits, votes = network(batch.image.contiguous(memory_format=torch.channels_last))
-    presence, center, log_scale = tally(vote_logits, votes)
+    return errors(*tally(vote_logits, votes), batch)
+
+
+def errors(presence: Tensor, center: Tensor, log_scale: Tensor, batch: FrameBatch) -> dict[str, float]:
+    """Median and 90th percentile of centre (pixels of 480) and scale (log) errors, and of presence: its accuracy."""
     seen, hidden = batch.visible > SEEN, batch.visible < HIDDEN
-    pixels = 480 * (center - batch.center).norm(dim=-1)[seen].float().numpy()
-    scales = (log_scale - batch.log_scale).abs()[seen].float().numpy()
+    pixels = 480 * (center - batch.center).norm(dim=-1)[seen].float().cpu().numpy()
+    scales = (log_scale - batch.log_scale).abs()[seen].float().cpu().numpy()
     return {"centre_px": float(np.median(pixels)), "centre_px_90": float(np.quantile(pixels, 0.9)),
             "log_scale": float(np.median(scales)), "log_scale_90": float(np.quantile(scales, 0.9)),
             "hit": float((presence[seen] > 0).float().mean()), "false": float((presence[hidden] > 0).float().mean())}

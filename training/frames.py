@@ -33,8 +33,9 @@ LEVELS = 4  # of the tile pyramid: 128, 64, 32, 16 pixels
 
 @dataclass(frozen=True)
 class FrameBatch:
-    """B images of K known objects: image [B, 3, 120, 120], mask [B, K, 60, 60], centre (u, v) in image widths
-    [B, K, 2], log_scale [B, K], visible [B, K] share of the object that is seen (0 where it is not there)."""
+    """B images of K known objects: image [B, 3, 120, 120], mask [B, K, 60, 60] (for the paper's networks: 120), centre
+    (u, v) in image widths [B, K, 2], log_scale [B, K], visible [B, K] share of the object that is seen (0 where it is
+    not there)."""
 
     image: Tensor
     mask: Tensor

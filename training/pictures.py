@@ -11,6 +11,7 @@ from PIL import Image
 from torch import Tensor
 
 from services.perception.networks import Extraction, tally
+from services.perception.paper import PaperExtraction
 from shared.generative_model import CCN
 from training.ccn import Pair
 from training.frames import FrameBatch
@@ -29,6 +30,14 @@ def draw_ccn(path: Path, ccn: CCN, pair: Pair) -> None:
     mean, _ = ccn.encoder(pair.first.masked)
     moved, _ = ccn.transition(mean, pair.displacement)
     _save(path, [pair.first.rgb, pair.first.masked[:, :3], ccn.decoder(mean), ccn.decoder(moved), pair.second.target])
+
+
+@torch.inference_mode()
+def draw_paper_extraction(path: Path, network: PaperExtraction, batch: FrameBatch, clean: Tensor) -> None:
+    """Rows: input | true mask | predicted mask | masked crop | the crop that it should be [B, 3, 64, 64]."""
+    mask, _, _, crop, _ = network(batch.image)
+    rows = (batch.image, batch.mask.expand(-1, 3, -1, -1), mask.expand(-1, 3, -1, -1), crop[:, :3], clean)
+    _save(path, [F.interpolate(row, size=batch.image.shape[-2:]) for row in rows])
 
 
 @torch.inference_mode()

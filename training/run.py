@@ -14,15 +14,17 @@ import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from services.perception.paper import CROP_SIDE_M
 from services.simulator.objects import load_mesh
 from services.simulator.views import crop_side_m
 from shared.config import REPOSITORY
 from shared.errors import SaccadeError
 from shared.provenance import commit
 from shared.weights import ObjectCard, write_weights
+from training.checkpoints import finished
 from training.dataset import render_missing
-from training.part import pick_device, read_checkpoint
-from training.settings import TrainingConfig, load_settings
+from training.part import pick_device
+from training.settings import EXTRACTION, TrainingConfig, load_settings
 
 
 def start(run_dir: Path, config: TrainingConfig) -> TrainingConfig:
@@ -58,8 +60,11 @@ def _train_parts(run_dir: Path, config: TrainingConfig, jobs: int, show) -> None
     running: dict[str, subprocess.Popen] = {}
     try:
         while waiting or running:
-            while waiting and len(running) < jobs:
-                part = waiting.pop(0)
+            while len(running) < jobs:
+                ready = [part for part in waiting if config.needs(part) not in (*waiting, *running)]
+                if not ready:
+                    break
+                waiting.remove(part := ready[0])
                 command = [sys.executable, "-m", "training.part", str(run_dir), part]
                 running[part] = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=REPOSITORY,
                                                  env={"OMP_NUM_THREADS": "1", **os.environ})
@@ -93,23 +98,27 @@ def export(run_dir: Path, weights_dir: Path) -> None:
     config = load_settings(run_dir)
     states, losses, seconds = {}, {}, 0.0
     for part in config.parts:
-        path = run_dir / part / "checkpoint.safetensors"
-        if not path.is_file():
-            raise SaccadeError(f"{path} is missing: that part is not trained yet")
-        facts, tensors = read_checkpoint(path)
-        if facts["step"] != config.steps(part):
-            raise SaccadeError(f"{part} is at step {facts['step']} of {config.steps(part)}: finish the training first")
-        states[part] = {k.removeprefix("model."): v for k, v in tensors.items() if k.startswith("model.")}
+        facts, states[part] = finished(run_dir, config, part)
         losses[part] = json.loads((run_dir / part / "losses.jsonl").read_text().splitlines()[-1])
         seconds += facts["seconds"]
-    cards = []
-    for name in config.names:
-        size = load_mesh(config.objects, name).size_m
-        cards.append(ObjectCard(name, size, crop_side_m(size)))
-    write_weights(weights_dir, states, tuple(cards), {
-        "data": f"{config.views} directions of each object of {config.objects!r}, from four ranges, composed",
+    paper = config.architecture == "paper"
+    sizes = {name: load_mesh(config.objects, name).size_m for name in config.names}
+    cards = tuple(ObjectCard(name, size, CROP_SIDE_M if paper else crop_side_m(size)) for name, size in sizes.items())
+    ranges = "from 0.40 m" if paper else "from four ranges"
+    write_weights(weights_dir, states, cards, {
+        **({"architecture": "paper", "calibration": _calibration(config, losses)} if paper else {}),
+        "data": f"{config.views} directions of each object of {config.objects!r}, {ranges}, composed",
         "training": config.model_dump(mode="json"), "losses": losses, "commit": commit(),
         "where_trained": _where(pick_device(config.device)), "seconds": round(seconds), "torch": torch.__version__})
+
+
+def _calibration(config: TrainingConfig, losses: dict[str, dict]) -> dict[str, float]:
+    """Standard deviations of the percepts of the paper's networks, which have no say in that themselves: of Gaussians
+    with the median errors that were measured on held-out views."""
+    measured = {name: losses[f"{name}.{EXTRACTION}"] for name in config.names}
+    pixel = {f"{name}.pixel_std": round(max(m["centre_px"] / 1.1774, 2.0), 2) for name, m in measured.items()}
+    return pixel | {f"{name}.log_scale_std": round(max(m["log_scale"] / 0.6745, 0.02), 4)
+                    for name, m in measured.items()}
 
 
 def _where(device: torch.device) -> str:

@@ -3,18 +3,27 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
-from pydantic import Field
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from shared.config import Section
 from shared.errors import SaccadeError
+from shared.generative_model import Architecture
 
 EXTRACTION = "extraction"
+# What holds for the paper's networks unless told otherwise: its batches and rates (appendix C), but fewer steps: its
+# 5,000 epochs of 450 views are 15,000 and 25,000.
+PAPER = {"steps_ccn": 5_000, "steps_extraction": 5_000, "batch_ccn": 150, "batch_extraction": 100,
+         "rate_ccn": 5e-4, "rate_extraction": 1e-4}
 
 
 class TrainingConfig(Section):
-    """`names`: objects that the networks shall know. `steps_*`: optimisation steps of the two phases."""
+    """`names`: objects that the networks shall know. `steps_*`: optimisation steps of the two phases.
+
+    `architecture` "paper": the paper's own networks, trained as it says; some settings then have other defaults.
+    `kl_extraction`: weight of the two KL terms in its phase 2. Neither is written where the architecture is "default".
+    """
 
     objects: Literal["pantry", "ycb"] = "pantry"
     names: tuple[str, ...]
@@ -28,15 +37,40 @@ class TrainingConfig(Section):
     rate_extraction: float = Field(2e-3, gt=0)
     checkpoint_every: int = Field(500, ge=1)
     device: Literal["auto", "cpu", "cuda"] = "auto"
+    architecture: Architecture = "default"
+    kl_extraction: float = Field(1.0, ge=0)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _defaults(cls, given: Any) -> Any:
+        return {**PAPER, **given} if isinstance(given, dict) and given.get("architecture") == "paper" else given
+
+    @model_serializer(mode="wrap")
+    def _tree(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        tree = handler(self)
+        if self.architecture == "default":
+            del tree["architecture"], tree["kl_extraction"]
+        return tree
 
     @property
     def parts(self) -> tuple[str, ...]:
-        """The networks that are trained, each independently of the others."""
+        """The networks that are trained: one process each."""
+        if self.architecture == "paper":
+            return (*self.names, *(f"{name}.{EXTRACTION}" for name in self.names))
         return (EXTRACTION, *self.names)
+
+    def is_extraction(self, part: str) -> bool:
+        """Whether a part is of phase 2."""
+        return part.rpartition(".")[2] == EXTRACTION
+
+    def needs(self, part: str) -> str | None:
+        """The part that has to be finished before this one begins: the paper freezes an object's CCN in phase 2."""
+        name, _, phase = part.rpartition(".")
+        return name if name and phase == EXTRACTION else None
 
     def steps(self, part: str) -> int:
         """Steps of one part."""
-        return self.steps_extraction if part == EXTRACTION else self.steps_ccn
+        return self.steps_extraction if self.is_extraction(part) else self.steps_ccn
 
 
 def load_settings(run_dir: Path) -> TrainingConfig:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -12,6 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from services.perception.cropping import Cropper, Window
 from services.perception.networks import INPUT_PX, Extraction, Identity, tally
+from services.perception.paper import PaperSceneCCN
+from services.perception.seen import Seen
 from shared.config import Config
 from shared.errors import SaccadeError
 from shared.generative_model import Decoder, Encoder, Stacked
@@ -21,20 +22,6 @@ from shared.topics import FRAME, GOAL, GOAL_PERCEPT, PERCEPT
 from shared.weights import Weights
 
 SERVICE = Service("perception", inputs=(FRAME, GOAL), trigger=FRAME, outputs=(PERCEPT, GOAL_PERCEPT))
-
-
-@dataclass(frozen=True)
-class Seen:
-    """What the networks made of one image, for K objects: see `Percept` for the units."""
-
-    presence: NDArray[np.float64]
-    pixel: NDArray[np.float64]
-    pixel_std: NDArray[np.float64]
-    scale: NDArray[np.float64]
-    log_scale_std: NDArray[np.float64]
-    latent_mean: NDArray[np.float32]
-    latent_std: NDArray[np.float32]
-    reconstruction_error: NDArray[np.float64]
 
 
 class SceneCCN:
@@ -74,12 +61,19 @@ class SceneCCN:
                     mean.numpy(), std.numpy(), error.double().numpy())
 
 
+def model_of(weights: Weights, names: tuple[str, ...], passes: int) -> SceneCCN | PaperSceneCCN:
+    """The networks of the weights' architecture."""
+    if weights.architecture == "paper":
+        return PaperSceneCCN(weights, names)
+    return SceneCCN(weights, names, passes)
+
+
 class Perception:
     """Frames in, percepts out; the goal image once per episode by the same networks."""
 
     def __init__(self, config: Config, names: tuple[str, ...]):
         self.names = names
-        self.model = SceneCCN(Weights(config.weights), names, config.perception.passes)
+        self.model = model_of(Weights(config.weights), names, config.perception.passes)
 
     def begin(self, run: str, episode: int) -> Iterable[Output]:
         """Nothing is kept from frame to frame."""

@@ -1,0 +1,120 @@
+"""The paper's own networks (appendix C): what "architecture": "paper" in the weights' manifest stands for.
+
+Each object has all of its own: a mask network, a spatial transformer network on the masked image, an identity network
+and a CCN on the crop. The crop is as the paper's: an affine cut of the masked image, on one scale for all objects.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor, nn
+
+from services.perception.seen import Seen
+from shared.generative_model import CROP_PX, Stacked, conv_stack, decoder_of, encoder_of
+from shared.geometry import IMAGE_SIZE_PX, INTRINSICS_PX, REFERENCE_RANGE_M
+from shared.weights import Weights
+
+MASK_PX, WHERE_PX = 64, 32  # sides of what the mask network and the spatial transformer network see
+CANVAS_PX = 120  # images at least this large are cut with several samples per crop pixel
+MEDIAN_PX = 5
+START = (1 / 1.0 - 0.2) / 3.8  # h of scale 1: an untrained spatial transformer cuts out the whole image
+CROP_SIDE_M = REFERENCE_RANGE_M * IMAGE_SIZE_PX / INTRINSICS_PX[0]  # what the image covers at 0.40 m
+# Standard deviations of a percept where the manifest gives none, common to all objects as the paper's covariance is.
+PIXEL_STD, LOG_SCALE_STD = 20.0, 0.15
+
+
+def median_pool(image: Tensor, side: int) -> Tensor:
+    """The median over side x side pixels around each of [B, 1, H, W]; the image is mirrored at its border."""
+    around = F.pad(image, [side // 2] * 4, mode="reflect")
+    return F.unfold(around, side).median(dim=1).values.view(image.shape)
+
+
+def spatial_transform(image: Tensor, center: Tensor, scale: Tensor) -> Tensor:
+    """The squares around `center` [B, 2] (image in [-1, 1]), `scale` [B] images wide, cut out of [B, C, H, H]:
+    [B, C, 64, 64]; black beyond the image."""
+    factor = max(1, round(image.shape[-1] / CANVAS_PX))
+    fine = factor * CROP_PX
+    axis = (torch.arange(fine, device=image.device) + 0.5) / fine * 2 - 1
+    x, y = (center[:, n, None] + scale[:, None] * axis for n in (0, 1))
+    grid = torch.stack([x[:, None].expand(-1, fine, -1), y[:, :, None].expand(-1, -1, fine)], dim=-1)
+    return F.avg_pool2d(F.grid_sample(image, grid, align_corners=False), factor)
+
+
+class MaskNetwork(nn.Module):
+    """alpha: image [B, 3, H, H] -> which pixels are of the object [B, 1, H, H], in (0, 1)."""
+
+    def __init__(self):
+        super().__init__()
+        self.convolutions = nn.Sequential(
+            nn.Conv2d(3, 16, 1), nn.LeakyReLU(), nn.Conv2d(16, 32, 3, padding=1), nn.LeakyReLU(),
+            nn.Conv2d(32, 64, 3, padding=1), nn.LeakyReLU(), nn.Conv2d(64, 1, 3, padding=1))
+
+    def forward(self, image: Tensor) -> Tensor:
+        small = F.interpolate(image, size=(MASK_PX, MASK_PX), mode="area")
+        mask = median_pool(self.convolutions(small).float(), MEDIAN_PX).sigmoid()
+        return F.interpolate(mask, size=image.shape[-2:], mode="bilinear", align_corners=False)
+
+
+class SpatialTransformer(nn.Module):
+    """Masked image [B, 3, H, H] -> centre [B, 2] (image in [-1, 1]) and scale [B] (0.40 m / range) of the object."""
+
+    def __init__(self):
+        super().__init__()
+        self.layers = nn.Sequential(
+            nn.Flatten(), nn.Linear(3 * WHERE_PX ** 2, 256), nn.LeakyReLU(), nn.Linear(256, 128), nn.LeakyReLU(),
+            nn.Linear(128, 64), nn.LeakyReLU(), nn.Linear(64, 3), nn.ELU())
+        with torch.no_grad():
+            self.layers[-2].bias.copy_(torch.tensor([0.0, 0.0, START]))
+
+    def forward(self, masked: Tensor) -> tuple[Tensor, Tensor]:
+        small = F.interpolate(masked, size=(WHERE_PX, WHERE_PX), mode="area")
+        center, h = self.layers(small).float().split([2, 1], dim=-1)
+        h = h + (h.clamp(min=0.0) - h).detach()  # ELU reaches below the formula's pole: held there, free to come back
+        return center, 1 / (3.8 * h.squeeze(-1) + 0.2)
+
+
+class PaperExtraction(nn.Module):
+    """What phase 2 trains for one object. Image [B, 3, H, H] -> mask [B, 1, H, H], centre [B, 2] (image in [-1, 1]),
+    scale [B], masked crop and its mask [B, 4, 64, 64], presence logit [B]."""
+
+    def __init__(self):
+        super().__init__()
+        self.mask, self.transformer = MaskNetwork(), SpatialTransformer()
+        self.identity = nn.Sequential(conv_stack(3, 1), nn.Linear(256, 1))
+
+    def forward(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        mask = self.mask(image)
+        center, scale = self.transformer(image * mask)
+        crop = spatial_transform(torch.cat([image * mask, mask], dim=1), center, scale)
+        return mask, center, scale, crop, self.identity(crop[:, :3]).float().squeeze(-1)
+
+
+class PaperSceneCCN:
+    """The paper's networks of K objects, evaluated together; `one_by_one` takes the slow way, for comparison."""
+
+    def __init__(self, weights: Weights, names: tuple[str, ...], *, one_by_one: bool = False):
+        self.cards = weights.cards_of(names)
+        extraction = Stacked([weights.fill(PaperExtraction(), f"{name}.extraction") for name in names])
+        encoder = Stacked([weights.fill(encoder_of("paper"), name, "ccn.encoder.") for name in names])
+        decoder = Stacked([weights.fill(decoder_of("paper"), name, "ccn.decoder.") for name in names])
+        networks = (extraction, encoder, decoder)
+        self.extraction, self.encoder, self.decoder = (n.one_by_one if one_by_one else n for n in networks)
+        self.pixel_std, self.log_scale_std = (
+            np.array([weights.calibration.get(f"{name}.{what}", otherwise) for name in names])
+            for what, otherwise in (("pixel_std", PIXEL_STD), ("log_scale_std", LOG_SCALE_STD)))
+
+    @torch.inference_mode()
+    def see(self, rgb: NDArray[np.uint8], intrinsics_px: ArrayLike, up: ArrayLike) -> Seen:
+        """Infers all objects from an image [H, H, 3]. The paper's crops neither know the camera nor which way is up."""
+        image = torch.from_numpy(np.array(rgb)).permute(2, 0, 1).float() / 255.0
+        everyone = image.expand(len(self.cards), 1, -1, -1, -1)
+        _, center, scale, crops, logit = (x[:, 0] for x in self.extraction(everyone))
+        mean, std = (x[:, 0] for x in self.encoder(crops[:, None, :3]))
+        masked, mask = crops[:, :3], crops[:, 3:]
+        error = ((self.decoder(mean[:, None])[:, 0] * mask - masked) ** 2).sum((1, 2, 3))
+        pixel = (center.double().numpy() + 1) / 2 * rgb.shape[1]
+        return Seen(logit.sigmoid().double().numpy(), pixel, self.pixel_std, scale.double().numpy(), self.log_scale_std,
+                    mean.numpy(), std.numpy(), error.double().numpy())

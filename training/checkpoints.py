@@ -1,0 +1,41 @@
+"""Reading what a part of a training run has left."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from safetensors import safe_open
+from safetensors.torch import load_file
+from torch import Tensor
+
+from shared.errors import SaccadeError
+from training.settings import TrainingConfig
+
+CHECKPOINT = "checkpoint.safetensors"
+
+
+def read_checkpoint(path: Path) -> tuple[dict, dict[str, Tensor]]:
+    """Facts and tensors of a checkpoint. Raises SaccadeError where it is damaged."""
+    try:
+        with safe_open(path, "pt") as file:
+            facts = json.loads(file.metadata()["facts"])
+        return facts, load_file(path)
+    except Exception as error:  # safetensors raises its own class for every kind of damage
+        raise SaccadeError(f"checkpoint {path} is damaged ({error}): remove it to train this part anew") from error
+
+
+def model_of(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The module's tensors in a checkpoint, without the optimiser's."""
+    return {k.removeprefix("model."): v for k, v in tensors.items() if k.startswith("model.")}
+
+
+def finished(run_dir: Path, config: TrainingConfig, part: str) -> tuple[dict, dict[str, Tensor]]:
+    """Facts and the module's tensors of a finished part. Raises SaccadeError where it is not finished."""
+    path = run_dir / part / CHECKPOINT
+    if not path.is_file():
+        raise SaccadeError(f"{path} is missing: that part is not trained yet")
+    facts, tensors = read_checkpoint(path)
+    if facts["step"] != config.steps(part):
+        raise SaccadeError(f"{part} is at step {facts['step']} of {config.steps(part)}: finish the training first")
+    return facts, model_of(tensors)

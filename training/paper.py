@@ -1,0 +1,120 @@
+"""Training the paper's own networks: per object loss L1, then, with its CCN frozen, loss L2 (equations 4 and 5)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from services.perception.paper import PaperExtraction
+from services.simulator.views import ObjectViews
+from shared.generative_model import CCN, kl_divergence
+from training.ccn import loss_l1, sample_pair
+from training.extraction import HIDDEN, SEEN, errors
+from training.frames import FrameBatch
+from training.paper_data import CleanViews, PaperFrames
+from training.pictures import draw_paper_extraction
+from training.settings import TrainingConfig
+from training.tasks import CcnTask, generator_of, split
+
+KL_TRANSITION = 10.0  # lambda_4 (table of optimisation)
+MASKING, CROPPING, IDENTIFICATION = 10.0, 10.0, 10.0
+EVALUATED = 100  # images
+
+
+class PaperCcnTask(CcnTask):
+    """Phase 1 of one object: loss L1 on clean views, every term on the whole batch."""
+
+    def _composer(self, mine: ObjectViews, others: list[ObjectViews], device: torch.device):
+        return CleanViews(mine, device)
+
+    def _networks(self) -> dict[str, nn.Module]:
+        return {"ccn": CCN("paper")}
+
+    def loss(self, step: int) -> tuple[Tensor, dict[str, float]]:
+        generator = self.generator(step)
+        pair = sample_pair(self.composer, self.train_index, self.config.batch_ccn, generator)
+        with torch.autocast(self.device.type, dtype=torch.bfloat16):
+            return loss_l1(self.ccn, pair, self.lambdas, generator, kl_transition=KL_TRANSITION, halves=False)
+
+
+class PaperExtractionTask:
+    """Phase 2 of one object: mask, spatial transformer and identity network with loss L2. `ccn`: the finished CCN."""
+
+    def __init__(self, config: TrainingConfig, views: list[ObjectViews], part: str, device: torch.device,
+                 ccn: dict[str, Tensor]):
+        torch.manual_seed(config.seed)
+        name = config.needs(part)
+        mine = next(v for v in views if v.name == name)
+        self.clean = CleanViews(mine, device)
+        self.frames = PaperFrames(mine, [v for v in views if v.name != name], device)
+        self.train_index, self.held_out = split(mine, config.seed, device)
+        frozen = nn.ModuleDict({"ccn": CCN("paper")})
+        frozen.load_state_dict(ccn)
+        self.ccn = frozen["ccn"].to(device, memory_format=torch.channels_last).eval().requires_grad_(False)
+        self.module = PaperExtraction().to(device, memory_format=torch.channels_last)
+        self.config, self.device, self.part, self.lambdas = config, device, part, []
+
+    def generator(self, *key: int) -> torch.Generator:
+        return generator_of(self.config, self.part, self.device, *key)
+
+    def _pick(self, index: Tensor, count: int, generator: torch.Generator) -> Tensor:
+        return index[torch.randint(len(index), (count,), generator=generator, device=self.device)]
+
+    def loss(self, step: int) -> tuple[Tensor, dict[str, float]]:
+        generator, count = self.generator(step), self.config.batch_extraction
+        first, second = (self._pick(self.train_index, count, generator) for _ in range(2))
+        batch = self.frames.compose(second, generator)
+        expected = self._expected(first, second, generator)
+        with torch.autocast(self.device.type, dtype=torch.bfloat16):
+            return loss_l2(self.module, self.ccn, batch, self.clean.clean(second), expected, self.config.kl_extraction)
+
+    @torch.no_grad()
+    def _expected(self, first: Tensor, second: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """p(p' | p, a) of the views `second` [B], where p is drawn from what the clean views `first` [B] show."""
+        mean, std = self.ccn.encoder(self.clean.clean(first))
+        azimuth = self.clean.azimuth[second] - self.clean.azimuth[first]
+        azimuth = torch.remainder(azimuth + torch.pi, 2 * torch.pi) - torch.pi
+        displacement = torch.stack([azimuth, self.clean.elevation[second] - self.clean.elevation[first]], dim=1)
+        noise = torch.randn(mean.shape, generator=generator, device=self.device)
+        return self.ccn.transition(mean + std * noise, displacement)
+
+    def after(self, step: int, smoothed: dict[str, float]) -> None:
+        """Nothing adapts."""
+
+    @torch.inference_mode()
+    def evaluate(self) -> dict[str, float]:
+        generator = self.generator(2 ** 31)
+        batch = self.frames.compose(self._pick(self.held_out, EVALUATED, generator), generator)
+        _, center, scale, _, logit = self.module(batch.image)
+        return errors(logit[:, None], (center[:, None] + 1) / 2, scale.log()[:, None], batch)
+
+    def draw(self, path: Path) -> None:
+        generator = self.generator(2 ** 31)
+        chosen = self._pick(self.held_out, 8, generator)
+        draw_paper_extraction(path, self.module, self.frames.compose(chosen, generator), self.clean.clean(chosen))
+
+
+def loss_l2(network: PaperExtraction, ccn: CCN, batch: FrameBatch, clean: Tensor, expected: tuple[Tensor, Tensor],
+            kl_weight: float) -> tuple[Tensor, dict[str, float]]:
+    """The masking, cropping and identification errors, and the KL terms of the latent that the crop gives: against the
+    one `expected` after a displacement, and against a standard normal. What is not seen has neither crop nor latent."""
+    mask, _, _, crop, logit = network(batch.image.contiguous(memory_format=torch.channels_last))
+    visible = batch.visible[:, 0]
+    seen = (visible > SEEN).float()
+    clear = ((visible > SEEN) | (visible < HIDDEN)).float()
+
+    def mean_of_seen(values: Tensor) -> Tensor:
+        return (values * seen).sum() / seen.sum().clamp(min=1.0)
+
+    masking = F.mse_loss(mask, batch.mask)
+    cropping = mean_of_seen(((crop[:, :3].float() - clean) ** 2).mean((1, 2, 3)))
+    identification = (F.binary_cross_entropy_with_logits(logit, seen, reduction="none") * clear).mean()
+    mean, std = ccn.encoder(crop[:, :3])
+    kl_move = mean_of_seen(kl_divergence(mean, std, *expected))
+    kl_prior = mean_of_seen(kl_divergence(mean, std, 0.0, 1.0))
+    loss = MASKING * masking + CROPPING * cropping + IDENTIFICATION * identification + kl_weight * (kl_move + kl_prior)
+    return loss, {"mask": float(masking.detach()), "crop": float(cropping.detach()),
+                  "presence": float(identification.detach()), "kl": float(kl_move.detach())}
