@@ -21,7 +21,7 @@ from shared.topics import TRUTH, Topic
 
 FOUND_M = 0.08  # a target believed further off was not found
 DIRECTION_RAD = 0.5  # a goal's direction believed further off is wrong
-SMALL_DPI, COLOURS = 60, 255  # there may be many: a picture takes some 40 kB
+SMALL_DPI, COLOURS = 60, 255  # there may be many: a picture takes some 20 kB
 
 CLASSES = {
     "target": ("Wrong target", "The goal image was taken for another object, or for none."),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -90,11 +90,16 @@ def prepare_again(results: Results, folder: Path, weights: Path | None = None) -
 
 
 def _scenes_file(results: Results, config: Config, folder: Path) -> Path:
+    """The file where it was, beside the results or in the present folder; else the suite, drawn once more."""
     wanted = results.facts["scenes"]
-    known = [REPOSITORY / wanted["file"], results.path.with_name(Path(wanted["file"]).name), Path(wanted["file"])]
-    if wanted.get("suite") in SUITES:
-        known.append(suite_file(wanted["suite"], config, folder / results.path.stem + SCENES_ENDING))
-    for path in known:
+
+    def candidates() -> Iterator[Path]:
+        yield from (REPOSITORY / wanted["file"], results.path.with_name(Path(wanted["file"]).name),
+                    Path(wanted["file"]))
+        if wanted.get("suite") in SUITES:
+            yield suite_file(wanted["suite"], config, folder / f"drawn{SCENES_ENDING}")
+
+    for path in candidates():
         if path.is_file() and hashlib.sha256(path.read_bytes()).hexdigest() == wanted["sha256"]:
             return path
     raise SaccadeError(f"the scenes of {results.path} are not to be found: put {wanted['file']} beside it")

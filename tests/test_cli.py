@@ -221,6 +221,9 @@ def test_oracle_run_leaves_a_whole_log_configuration_and_picture(monkeypatch, ca
     assert "reached 2 of 2 goals" in text
     assert "azimuth" in text
     assert {path.name for path in out.iterdir()} == {"run.mcap", "config.json", "picture.png"}
+    again = tmp_path / "again.png"
+    assert call(monkeypatch, capsys, "picture", out, "--out", again)[0] == 0
+    assert again.read_bytes() == (out / "picture.png").read_bytes()
     report, config = missing(out / "run.mcap"), load(out / "config.json")
     assert report.complete, report
     assert (config.seed, config.scene.n_objects, config.scene.yaw, len(config.scene.names)) == (4, 2, "fixed", 5)

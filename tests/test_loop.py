@@ -7,6 +7,7 @@ import queue
 import threading
 from collections import defaultdict
 from contextlib import closing
+from dataclasses import replace
 
 import msgpack
 import numpy as np
@@ -107,6 +108,22 @@ def test_bus_and_one_process_give_the_same_bytes(kind):
 
 def test_passing_messages_unencoded_changes_no_byte():
     assert locally(encoded=False) == locally(encoded=True)
+
+
+def test_chosen_episodes_are_those_of_the_whole_run():
+    """Only the sequence numbers tell; every step of a core is timed under its service's name."""
+
+    def messages(episodes, seen, steps):
+        run_local(pairs(CONFIG), PARTS, "r", episodes,
+                  lambda t, p, m, _: seen.append((t, p, encode(replace(m, seq=0)))),
+                  on_step=lambda service, milliseconds: steps.append((service, milliseconds >= 0)))
+        return by_key(e for e in seen if decode(e[0].type, e[2]).episode == 1)
+
+    alone, steps = [], []
+    assert messages((1,), alone, steps) == messages(None, [], [])
+    assert all(decode(topic.type, payload).episode == 1 for topic, _, payload in alone)
+    assert set(steps) == {(name, True) for name in SERVICES}
+    assert steps.count(("planner", True)) == CONFIG.simulator.max_steps
 
 
 def test_sequence_numbers_count_the_messages_of_each_key():

@@ -124,8 +124,8 @@ class FakePlanner:
         at = {"run": beliefs[0].run, "episode": beliefs[0].episode, "step": beliefs[0].step}
         move = np.tanh(sum(b.mean_m for b in beliefs) / 1e4 + beliefs[0].particles_m.sum() / 1e9) / 4
         yield Output(PLAN, Plan(**at, target="mug", mode="seek", viewpoint=IDENTITY, look_at_m=move, g_position=1.0,
-                                g_scale=0.0, g_pose=0.0, g_information=0.0, candidates=1, believed_distance_m=-1.0,
-                                arrived=False))
+                                g_scale=0.0, g_pose=0.0, g_information=0.0, candidates=1, goal_confidence=1.0,
+                                believed_distance_m=-1.0, arrived=False))
         yield Output(ACTION, Action(**at, translation_m=move, rotation_rad=move[::-1] / 2))
 
 
