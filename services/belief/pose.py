@@ -59,8 +59,7 @@ class GoalView:
         self.measured_range_m = REFERENCE_RANGE_M / goal.scale
         elevation, azimuth = viewing_grid()
         self.elevation, self.azimuth = (x.ravel() for x in np.meshgrid(elevation, azimuth, indexing="ij"))
-        # cells cover less of the sphere towards the pole: the prior is even over directions, not over cells
-        self.prior = np.log(np.cos(self.elevation)).reshape(GRID_ELEVATIONS, GRID_AZIMUTHS)
+        self.prior = np.zeros((GRID_ELEVATIONS, GRID_AZIMUTHS))  # even in elevation, as goals are drawn (section 4.1)
         self.keyframes: list[Keyframe] = []
         self.center: Array | None = None
 

@@ -41,8 +41,9 @@ KNOWN_M = 0.10  # objects less certain than this are no obstacle yet
 ARRIVED_M, ARRIVED_RAD = 0.01, 0.05
 STUCK_M = 0.002  # a camera that moves less is as near as it can be
 TURN_M = 0.10  # from here on the camera turns as planned; before, it keeps looking at what it is about
-VISITED_M, VISITED_RAD = 0.06, 0.4  # around a view that turned out not to be the goal's
-VISITED_COST = 8.0  # nats
+VISITED_M, VISITED_RAD = 0.05, 0.35  # around a view that turned out not to be the goal's
+VISITED_COST = 6.0  # nats
+DOUBT_LIMIT = 2.5
 SURE = 0.6  # that this is the goal's view, before the agent says so
 PEAK_CELLS = (2, 4)  # the posterior's peak is averaged over so many cells of elevation and azimuth to each side
 
@@ -144,8 +145,7 @@ class Planner:
         terms = expected_free_energy(eyes, gazes, beliefs, self.preference if found else None,
                                      self.config.planner.information_weight)
         if found:  # each time that the best was not it, the belief is trusted less, and other places are tried
-            doubt = 1.0 / (1.0 + len(self.visited))
-            cost = doubt * (terms.pose + terms.scale) + terms.position + terms.information
+            cost = (terms.pose + terms.scale) / self._doubt + terms.position + terms.information
             cost = cost + self._visited_cost(eyes, target.mean_m)
         else:  # among views that tell the same, the nearest
             cost = terms.total + 0.3 * np.linalg.norm(eyes - camera[:3, 3], axis=1)
@@ -156,6 +156,12 @@ class Planner:
             self.viewpoint = look_at(clip(eyes[chosen], spheres), gazes[chosen])
         self.age = 0
         self.plan = self._plan(stamp, mode, gazes[chosen], terms, chosen)
+
+    @property
+    def _doubt(self) -> float:
+        """By how much the belief about the goal's view is softened: more after every view that was not it, to a limit,
+        or the agent would forget what it knows."""
+        return min(1.0 + len(self.visited), DOUBT_LIMIT)
 
     def _candidates(self, target: Belief | None, beliefs: dict[str, Belief],
                     rng: np.random.Generator) -> tuple[Array, Array]:
@@ -168,7 +174,7 @@ class Planner:
         eyes = rng.uniform(LOWER_M, UPPER_M, (count, 3))
         if self.preference is None:
             return eyes, gazes
-        third, doubt = count // 3, 1.0 + len(self.visited)
+        third, doubt = count // 3, self._doubt
         reach = self.preference.range_m + rng.normal(0, 0.10, third)
         away = unit(eyes[third:2 * third] - gazes[third:2 * third])
         eyes[third:2 * third] = gazes[third:2 * third] + np.maximum(reach, 0.1)[:, None] * away
