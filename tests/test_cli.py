@@ -235,7 +235,7 @@ def test_oracle_run_leaves_a_whole_log_configuration_and_picture(monkeypatch, ca
 def test_bus_and_one_process_log_the_same_bytes(tmp_path):
     """The shipped agent as processes on Zenoh and within this process; but for the statuses, which time makes."""
     episode = small(REPOSITORY / "weights" / "pantry", **{
-        "simulator.max_steps": 12, "planner.candidates": 5000, "scene.n_objects": 4})
+        "simulator.max_steps": 12, "planner.candidates": 5000, "scene.n_objects": 2})
     logs = []
     for kind in ("zenoh", "local"):
         out = tmp_path / kind / "same"
