@@ -106,6 +106,13 @@ class Config(Section):
         suffix = "" if self.perception.architecture == "default" else f"-{self.perception.architecture}"
         return self.perception.weights or REPOSITORY / "weights" / f"{self.scene.objects}{suffix}"
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The objects of the run. Raises SaccadeError where they are not resolved."""
+        if not self.scene.names:
+            raise SaccadeError("configuration key 'scene.names' is empty: the objects of the run are not resolved")
+        return self.scene.names
+
     def with_values(self, values: dict[str, Any]) -> Config:
         """A copy with dotted keys replaced (`{"scene.yaw": "fixed"}`). Raises SaccadeError for an unknown key."""
         tree = self.model_dump(mode="json")

@@ -32,9 +32,7 @@ def main(service: Service, build: Callable[[Config], Core], *, source: bool = Fa
     """
 
     def work(config: Config, folder: Path, inbox: Inbox) -> None:
-        names = parts if parts is not None else config.scene.names
-        if names is None:
-            raise SaccadeError("configuration key 'scene.names' is empty: the objects of the run are not resolved")
+        names = parts if parts is not None else config.names
         core = build(config)
         bus = ZenohBus(config.bus.endpoint, world=config.bus.world)
         try:

@@ -33,7 +33,7 @@ def cameras(count=8):
 
 def test_views_from_several_sides_find_the_object():
     """Noisy percepts from an arc: the mean comes within 2 cm and the true position within 3 deviations."""
-    rng, position = np.random.default_rng(0), None
+    rng = np.random.default_rng(0)
     position = PositionFilter(CONFIG, rng)
     before = np.trace(position.moments()[1])
     for camera in cameras():
@@ -116,10 +116,10 @@ def test_a_lost_object_is_found_again():
 
 def test_the_filter_leaves_numpys_global_state_alone():
     np.random.seed(7)
-    expected = np.random.default_rng, np.random.get_state()[1].copy()
+    expected = np.random.get_state()[1].copy()
     position = PositionFilter(CONFIG, np.random.default_rng(0))
     position.seen(percept(start_pose()), np.random.default_rng(1))
-    assert (np.random.get_state()[1] == expected[1]).all()
+    assert (np.random.get_state()[1] == expected).all()
 
 
 class Turning(torch.nn.Module):

@@ -26,6 +26,7 @@ from shared.errors import SaccadeError
 from shared.generative_model import CCN, LATENT, PaperDecoder, Stacked, transition_of
 from shared.geometry import INTRINSICS_PX
 from shared.weights import MANIFEST, Weights
+from tests.fakes.training import assert_same_checkpoint, interrupt_and_resume
 from tests.fakes.weights import write_random_weights
 from training.dataset import load_views
 from training.paper_data import CleanViews, PaperFrames
@@ -179,29 +180,14 @@ def test_an_unknown_architecture_is_told(tmp_path):
 
 @pytest.mark.parametrize("part", ["soup_can", "soup_can.extraction"])
 def test_an_interrupted_run_goes_on_exactly(finished, tmp_path, part):
-    from safetensors.torch import load_file
 
     torch.set_num_threads(1)  # as the processes do: more threads add in another order
     (tmp_path / "views").symlink_to(finished / "views")
     if part != "soup_can":
         (tmp_path / "soup_can").symlink_to(finished / "soup_can")
     start(tmp_path, TINY)
-    first = Trainer(tmp_path, part)
-    loss = first.task.loss
-
-    def interrupted(step):
-        if step == 3:  # after the checkpoint at 2
-            raise KeyboardInterrupt
-        return loss(step)
-
-    first.task.loss = interrupted
-    with pytest.raises(KeyboardInterrupt):
-        first.train()
-    Trainer(tmp_path, part).train()
-    whole, resumed = (load_file(folder / part / "checkpoint.safetensors") for folder in (finished, tmp_path))
-    assert whole.keys() == resumed.keys()
-    for key, value in whole.items():
-        assert torch.equal(value, resumed[key]), key
+    interrupt_and_resume(tmp_path, part, before_step=3)  # after the checkpoint at 2, before the next
+    assert_same_checkpoint(finished, tmp_path, part)
 
 
 def test_a_run_leaves_losses_and_pictures(finished):

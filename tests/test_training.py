@@ -11,6 +11,7 @@ from services.perception.core import SceneCCN
 from shared.errors import SaccadeError
 from shared.geometry import IMAGE_SIZE_PX, INTRINSICS_PX
 from shared.weights import Weights
+from tests.fakes.training import assert_same_checkpoint, interrupt_and_resume
 from training.crops import CropComposer
 from training.dataset import load_views
 from training.frames import FrameComposer
@@ -31,33 +32,13 @@ def finished(tmp_path_factory):
     return run_dir
 
 
-def tensors(run_dir, part):
-    from safetensors.torch import load_file
-
-    return load_file(run_dir / part / "checkpoint.safetensors")
-
-
 @pytest.mark.parametrize("part", [EXTRACTION, "soup_can"])
 def test_an_interrupted_run_goes_on_exactly(finished, tmp_path, part):
     torch.set_num_threads(1)  # as the processes do: more threads add in another order
     (tmp_path / "views").symlink_to(finished / "views")
     start(tmp_path, TINY)
-    first = Trainer(tmp_path, part)
-    loss = first.task.loss
-
-    def interrupted(step):
-        if step == 3:  # after the checkpoint at 2, in the middle of the way to the next
-            raise KeyboardInterrupt
-        return loss(step)
-
-    first.task.loss = interrupted
-    with pytest.raises(KeyboardInterrupt):
-        first.train()
-    Trainer(tmp_path, part).train()
-    whole, resumed = tensors(finished, part), tensors(tmp_path, part)
-    assert whole.keys() == resumed.keys()
-    for key, value in whole.items():
-        assert torch.equal(value, resumed[key]), key
+    interrupt_and_resume(tmp_path, part, before_step=3)  # after the checkpoint at 2, before the next
+    assert_same_checkpoint(finished, tmp_path, part)
 
 
 def test_a_run_leaves_losses_pictures_and_weights_that_load(finished, tmp_path):

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from services.perception.networks import Extraction, Identity
 from services.simulator.views import ObjectViews
 from shared.generative_model import CCN
-from training.ccn import adapt, goal_search_errors, identity_loss, loss_l1, sample_pair
+from training.ccn import LAMBDA_EVERY, adapt, goal_search_errors, identity_loss, loss_l1, sample_pair
 from training.crops import CropComposer
 from training.extraction import extraction_errors, loss_l2
 from training.frames import FrameComposer
@@ -68,7 +68,7 @@ class CcnTask:
         return loss + IDENTITY_WEIGHT * identity, {**parts, "identity": float(identity.detach())}
 
     def after(self, step: int, smoothed: dict[str, float]) -> None:
-        if step % 500 == 0:
+        if step % LAMBDA_EVERY == 0:
             self.lambdas = adapt(self.lambdas, [smoothed["first"], smoothed["second"], smoothed["moved"]])
 
     def evaluate(self) -> dict[str, float]:

@@ -11,7 +11,6 @@ from services.belief.free_energy import crop_term, identity_term, likelihood_ter
 from services.belief.pose import GoalView
 from services.belief.position import PositionFilter, evidence_of
 from shared.config import Config
-from shared.errors import SaccadeError
 from shared.generative_model import transition_of
 from shared.messages import Belief, Percept
 from shared.seeding import generator
@@ -102,6 +101,4 @@ class BeliefFilter:
 
 def build(config: Config) -> BeliefFilter:
     """The core for a run's configuration."""
-    if not config.scene.names:
-        raise SaccadeError("configuration key 'scene.names' is empty: name the objects to believe in")
-    return BeliefFilter(config, config.scene.names)
+    return BeliefFilter(config, config.names)

@@ -86,7 +86,10 @@ class GoalView:
     def here(self, percept: Percept) -> float:
         """Share of the present view's say that falls to the directions around its own."""
         eye = percept.world_from_camera[:3, 3]
-        share = np.exp(self._likelihood(eye, torch.from_numpy(np.array(percept.latent_mean)))).ravel()
+        mean = torch.from_numpy(np.array(percept.latent_mean))
+        last = self.keyframes[-1]
+        kept = np.array_equal(last.eye, eye) and torch.equal(last.mean, mean)
+        share = np.exp(last.log_likelihood if kept else self._likelihood(eye, mean)).ravel()
         near = direction(self.azimuth, self.elevation) @ unit(eye - self.center) > np.cos(HERE_RAD)
         # near the pole the azimuth turns the image: only what is turned as seen from here counts
         azimuth, elevation, _ = spherical(eye, self.center)

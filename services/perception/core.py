@@ -14,7 +14,6 @@ from services.perception.networks import INPUT_PX, Extraction, Identity, tally
 from services.perception.paper import PaperSceneCCN
 from services.perception.seen import Seen
 from shared.config import Config
-from shared.errors import SaccadeError
 from shared.generative_model import Decoder, Encoder, Stacked
 from shared.messages import Frame, Goal, Percept
 from shared.service import Inputs, Output, Service
@@ -114,6 +113,4 @@ def percept(source: Frame | Goal, name: str, seen: Seen, k: int, world_from_came
 
 def build(config: Config) -> Perception:
     """The core for a run's configuration."""
-    if not config.scene.names:
-        raise SaccadeError("configuration key 'scene.names' is empty: name the objects to look for")
-    return Perception(config, config.scene.names)
+    return Perception(config, config.names)

@@ -16,7 +16,6 @@ from services.planner.free_energy import Terms, expected_free_energy
 from services.planner.goal import aim, infer_preference
 from services.planner.motion import step_towards
 from shared.config import Config
-from shared.errors import SaccadeError
 from shared.geometry import (
     Array,
     direction,
@@ -245,6 +244,4 @@ def _between(a: Array, b: Array) -> tuple[float, float]:
 
 def build(config: Config) -> Planner:
     """The core for a run's configuration."""
-    if not config.scene.names:
-        raise SaccadeError("configuration key 'scene.names' is empty: name the objects to plan for")
-    return Planner(config, config.scene.names)
+    return Planner(config, config.names)

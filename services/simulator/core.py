@@ -62,15 +62,11 @@ class Simulator:
 
     def step(self, inputs: Inputs) -> list[Output]:
         """Moves the camera; gives what it sees then. Nothing once the episode is over."""
-        if self._done:
+        if self.state.done:
             return []
         action = inputs["action"]
         self.state.act(action.translation_m, action.rotation_rad, arrived=action.arrived)
         return self._outputs()
-
-    @property
-    def _done(self) -> bool:
-        return self.state.done
 
     def _stamp(self) -> dict[str, str | int]:
         return {"run": self._run, "episode": self._episode, "step": self.state.step}
@@ -89,7 +85,7 @@ class Simulator:
 
     def _outputs(self) -> list[Output]:
         truth = Output(TRUTH, self._truth())
-        return [truth] if self._done else [Output(FRAME, self._frame()), truth]
+        return [truth] if self.state.done else [Output(FRAME, self._frame()), truth]
 
     def _frame(self) -> Frame:
         camera = self.state.camera
@@ -103,7 +99,7 @@ class Simulator:
         return Truth(**self._stamp(), scene=scene.id, target=scene.target, names=[p.name for p in present],
                      centers_m=state.spheres.centers_m, yaws_rad=yaws, keep_out_m=state.spheres.radii_m,
                      target_center_m=scene.target_placed.center_m, world_from_camera=state.camera,
-                     goal_world_from_camera=state.goal, success=state.reached, done=self._done,
+                     goal_world_from_camera=state.goal, success=state.reached, done=state.done,
                      declared=state.declared, declared_true=state.declared_true)
 
 
