@@ -125,7 +125,8 @@ def train(*, objects: Objects = None, names: Names = None,
           device: Annotated[Literal["auto", "cpu", "cuda"] | None, typer.Option(help="[default: auto]")] = None,
           architecture: Annotated[Literal["default", "paper"], typer.Option(
               help="our networks, or those of the paper's tables; theirs go to folders named <set>-paper")] = "default",
-          weights: WeightsFolder = None) -> None:
+          weights: WeightsFolder = None, values: Annotated[list[str] | None, typer.Option(
+              "--set", metavar="KEY=VALUE", help="any key of training/settings.py, e.g. batch_ccn=64")] = None) -> None:
     """Train the networks of an object set; given again after an interruption, go on from there."""
     from rich.console import Console
 
@@ -133,13 +134,15 @@ def train(*, objects: Objects = None, names: Names = None,
     from shared.config import REPOSITORY, SceneConfig
     from training.run import export
     from training.run import train as run_training
-    from training.settings import TrainingConfig
+    from training.settings import settings_from
 
     object_set = objects or "pantry"
     given = {"seed": seed, "steps_ccn": steps_ccn, "steps_extraction": steps_extraction, "views": views,
              "device": device, "architecture": architecture}
     chosen = names_in_use(SceneConfig(objects=object_set, names=split_names(names)))
-    settings = TrainingConfig(objects=object_set, names=chosen, **{k: v for k, v in given.items() if v is not None})
+    settings = settings_from({"objects": object_set, "names": chosen}
+                             | {k: v for k, v in given.items() if v is not None}
+                             | dict(parse_value(text) for text in values or ()))
     name = object_set if architecture == "default" else f"{object_set}-{architecture}"
     folder, target = out or Path("training_runs") / name, weights or REPOSITORY / "weights" / name
     run_training(folder, settings, jobs=jobs, console=Console())

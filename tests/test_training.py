@@ -18,6 +18,7 @@ from training.frames import FrameComposer
 from training.part import Trainer, pick_device
 from training.run import export, start, train
 from training.settings import EXTRACTION, TrainingConfig
+from training.strangers import recoloured
 
 NAMES = ("soup_can", "rice_box")
 TINY = TrainingConfig(objects="pantry", names=NAMES, views=24, steps_ccn=4, steps_extraction=4, batch_ccn=8,
@@ -83,6 +84,25 @@ def test_the_composed_frames_agree_with_their_labels(finished):
             whole += 1
     assert whole >= 5
     assert float(batch.mask[batch.visible == 0].sum()) == 0.0
+
+
+def test_strangers_are_drawn_but_have_no_label(finished):
+    """Every image holds a stranger alone: something is drawn on the table, and no known object is labelled."""
+    composer = FrameComposer([load_views(finished, name) for name in NAMES], torch.device("cpu"))
+    composer._chosen = lambda goal_like, rng: [composer.known]
+    batch = composer.compose(20, np.random.default_rng(0))
+    shades = [len(torch.unique((image[:, ::4, ::4] * 8).round().flatten(1), dim=1).T) for image in batch.image]
+    assert np.median(shades) > 10
+    assert float(batch.mask.sum()) == float(batch.visible.sum()) == 0.0
+
+
+def test_a_recoloured_object_is_another(finished):
+    """A known object's texture becomes a stranger's only in colours that are clearly not its own."""
+    rng, views = np.random.default_rng(0), load_views(finished, NAMES[0])
+    for tile in views.tiles[0, ::5] / 255.0:
+        rgb, alpha = tile[..., :3] / np.maximum(tile[..., 3:], 1e-3), tile[..., 3:]
+        other = recoloured(tile[..., :3], alpha, rng)
+        assert (np.abs(other - rgb) * alpha).sum() / (3 * alpha.sum()) > 0.1
 
 
 def test_another_run_is_not_overwritten(finished):

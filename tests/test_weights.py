@@ -74,6 +74,6 @@ def test_shipped_weights_are_whole_small_and_say_where_they_come_from(folder):
         weights.state(path.stem)
     assert sum(path.stat().st_size for path in files) <= 15e6
     facts = json.loads((folder / MANIFEST).read_text())
-    for key in ("data", "training", "losses", "commit", "where_trained", "seconds"):
+    for key in ("data", "training", "losses", "commits", "where_trained", "seconds"):
         assert facts[key]
     assert facts["training"]["seed"] is not None

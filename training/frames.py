@@ -27,8 +27,14 @@ from shared.geometry import (
     rotation_towards,
     spherical,
 )
+from training.strangers import strangers, texture
 
 LEVELS = 4  # of the tile pyramid: 128, 64, 32, 16 pixels
+STRANGERS = 1  # key of their randomness
+GOAL_LIKE = 0.25  # share of images as goals show them: one object, from any elevation alike
+STRANGE_GOAL = 0.25  # share of these with an object that nobody knows,
+STRANGE = (0.65, 0.25, 0.10)  # and of the others with none, one and two of them
+TEXTURED = 0.04  # share of images with a texture instead of a table
 
 
 @dataclass(frozen=True)
@@ -60,13 +66,15 @@ class _Instance:
 
 
 class FrameComposer:
-    """Composes images of all objects in `views`. All randomness comes from the generators of each call."""
+    """Composes images of the `known` objects, and of strangers that have no label, drawn once from `seed`. All other
+    randomness comes from the generators of each call."""
 
-    def __init__(self, views: list[ObjectViews], device: torch.device):
-        self.views, self.device = views, device
-        self.pyramid = [_pyramid(v, device) for v in views]
-        self.coverage = [torch.as_tensor(v.tiles[..., 3].mean((2, 3)) / 255.0) for v in views]  # [S, N]
-        self.directions = [direction(v.azimuth_rad, v.elevation_rad) for v in views]
+    def __init__(self, known: list[ObjectViews], device: torch.device, seed: int = 0):
+        self.known, self.device = len(known), device
+        self.views = [*known, strangers(known, np.random.default_rng([seed, STRANGERS]))]
+        self.pyramid = [_pyramid(v, device) for v in self.views]
+        self.coverage = [torch.as_tensor(v.tiles[..., 3].mean((2, 3)) / 255.0) for v in known]  # [S, N]
+        self.directions = [direction(v.azimuth_rad, v.elevation_rad) for v in self.views]
         axis = (np.arange(INPUT_PX) + 0.5) * IMAGE_SIZE_PX / INPUT_PX
         u, v = np.meshgrid(axis, axis)
         self.rays = pixel_rays(np.stack([u, v], -1), INTRINSICS_PX)  # [120, 120, 3]
@@ -84,15 +92,15 @@ class FrameComposer:
 
     def _scene(self, rng: np.random.Generator):
         """A camera pose and objects [(which, centre [3], yaw)]: as the agent meets them, and as goals show them."""
-        goal_like = rng.random() < 0.2
-        number = 1 if goal_like else int(rng.integers(0 if rng.random() < 0.2 else 1, min(5, len(self.views)) + 1))
+        goal_like = rng.random() < GOAL_LIKE
         placed = []
-        for which in rng.permutation(len(self.views))[:number]:
-            placed.append((int(which), self._free_place(int(which), placed, rng), rng.uniform(0, 2 * np.pi)))
+        for which in self._chosen(goal_like, rng):
+            placed.append((which, self._free_place(which, placed, rng), rng.uniform(0, 2 * np.pi)))
         if placed and (goal_like or rng.random() < 0.55):
             which, center, _ = placed[0]
             half = np.linalg.norm(self.views[which].size_m) / 2
-            offset = direction(rng.uniform(0, 2 * np.pi), np.arcsin(rng.random()))
+            elevation = rng.uniform(0, np.pi / 2) if goal_like else np.arcsin(rng.random())
+            offset = direction(rng.uniform(0, 2 * np.pi), elevation)
             position = center + rng.uniform(half + 0.05, 0.5 if goal_like else 0.8) * offset
             target = center + rng.normal(0, 0.0 if goal_like and rng.random() < 0.7 else 0.06, 3)
         else:
@@ -109,6 +117,15 @@ class FrameComposer:
         if goal_like:
             camera[:3, :3] = rotation
         return camera, placed
+
+    def _chosen(self, goal_like: bool, rng: np.random.Generator) -> list[int]:
+        """Which objects stand there: known ones, each once, and up to two strangers, in any order."""
+        if goal_like:
+            return [self.known if rng.random() < STRANGE_GOAL else int(rng.integers(self.known))]
+        number = int(rng.integers(0 if rng.random() < 0.2 else 1, min(5, self.known) + 1))
+        chosen = [int(which) for which in rng.permutation(self.known)[:number]]
+        chosen += [self.known] * int(rng.choice(3, p=STRANGE))
+        return [chosen[n] for n in rng.permutation(len(chosen))]
 
     def _free_place(self, which: int, placed: list, rng: np.random.Generator) -> NDArray[np.float64]:
         size = self.views[which].size_m
@@ -177,7 +194,7 @@ class FrameComposer:
         return layers
 
     def _backgrounds(self, cameras: list, rng: np.random.Generator) -> Tensor:
-        """The table in one colour on black, or two colours with a random border, or patches."""
+        """The table in one colour on black, or two colours with a random border; rarely a texture all over."""
         images = np.zeros((len(cameras), INPUT_PX, INPUT_PX, 3), dtype=np.float32)
         for image, camera in zip(images, cameras, strict=True):
             rays = self.rays @ camera[:3, :3].T
@@ -189,13 +206,17 @@ class FrameComposer:
                 angle, where = rng.uniform(0, 2 * np.pi), rng.uniform(-0.4, 0.4)
                 side = self.rays[..., 0] * np.cos(angle) + self.rays[..., 1] * np.sin(angle) > where
                 image[side & (table | (rng.random() < 0.5))] = rng.random(3)
+            if rng.random() < TEXTURED:
+                image[:] = texture(rng, INPUT_PX)
         return torch.as_tensor(images, device=self.device).permute(0, 3, 1, 2).contiguous()
 
     def _labels(self, count: int, instances, image: Tensor, visible_px: list[float], masks) -> FrameBatch:
-        k = len(self.views)
+        k = self.known
         mask = torch.zeros(count, k, MASK_PX, MASK_PX, device=self.device)
         center, log_scale, visible = torch.zeros(count, k, 2), torch.zeros(count, k), torch.zeros(count, k)
         for n, instance in enumerate(instances):
+            if instance.object >= k:
+                continue
             where = (instance.scene, instance.object)
             whole = float(self.coverage[instance.object][instance.shell, instance.index]) * instance.side_px ** 2
             mask[where] = masks[n]

@@ -20,6 +20,7 @@ from torch import Tensor, nn
 
 from services.simulator.views import ObjectViews
 from shared.errors import SaccadeError
+from shared.provenance import commit
 from training.checkpoints import CHECKPOINT, finished, model_of, read_checkpoint
 from training.dataset import load_views
 from training.paper import PaperCcnTask, PaperExtractionTask
@@ -72,7 +73,7 @@ class Trainer:
         self.steps, self.clip = self.config.steps(part), 5.0 if extraction else 5000.0
         self.optimizer = torch.optim.Adam(self.task.module.parameters(), lr=self.peak,
                                           amsgrad=not (paper and extraction))
-        self.step, self.seconds, self.smoothed = 0, 0.0, {}
+        self.step, self.seconds, self.smoothed, self.commit = 0, 0.0, {}, commit()
         self.resume()
 
     def train(self) -> None:
@@ -110,7 +111,8 @@ class Trainer:
         tensors = {f"model.{k}": v.contiguous() for k, v in self.task.module.state_dict().items()}
         for n, state in self.optimizer.state_dict()["state"].items():
             tensors |= {f"optimizer.{n}.{k}": torch.as_tensor(v).contiguous() for k, v in state.items()}
-        facts = {"step": self.step, "seconds": self.seconds, "lambdas": self.task.lambdas, "smoothed": self.smoothed}
+        facts = {"step": self.step, "seconds": self.seconds, "lambdas": self.task.lambdas, "smoothed": self.smoothed,
+                 "commit": self.commit}
         temporary = self.folder / "checkpoint.tmp"
         save_file(tensors, temporary, metadata={"facts": json.dumps(facts)})
         os.replace(temporary, self.folder / CHECKPOINT)

@@ -19,7 +19,6 @@ from services.simulator.objects import load_mesh
 from services.simulator.views import crop_side_m
 from shared.config import REPOSITORY
 from shared.errors import SaccadeError
-from shared.provenance import commit
 from shared.weights import ObjectCard, write_weights
 from training.checkpoints import finished
 from training.dataset import render_missing
@@ -96,10 +95,11 @@ def _show_part(run_dir: Path, part: str, config: TrainingConfig, show) -> None:
 def export(run_dir: Path, weights_dir: Path) -> None:
     """Writes the weights of a finished run and their manifest. Raises SaccadeError where a part is not finished."""
     config = load_settings(run_dir)
-    states, losses, seconds = {}, {}, 0.0
+    states, losses, commits, seconds = {}, {}, {}, 0.0
     for part in config.parts:
         facts, states[part] = finished(run_dir, config, part)
         losses[part] = json.loads((run_dir / part / "losses.jsonl").read_text().splitlines()[-1])
+        commits[part] = facts.get("commit", "unknown")
         seconds += facts["seconds"]
     paper = config.architecture == "paper"
     sizes = {name: load_mesh(config.objects, name).size_m for name in config.names}
@@ -108,7 +108,7 @@ def export(run_dir: Path, weights_dir: Path) -> None:
     write_weights(weights_dir, states, cards, {
         **({"architecture": "paper", "calibration": _calibration(config, losses)} if paper else {}),
         "data": f"{config.views} directions of each object of {config.objects!r}, {ranges}, composed",
-        "training": config.model_dump(mode="json"), "losses": losses, "commit": commit(),
+        "training": config.model_dump(mode="json"), "losses": losses, "commits": commits,
         "where_trained": _where(pick_device(config.device)), "seconds": round(seconds), "torch": torch.__version__})
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
+from pydantic import Field, SerializerFunctionWrapHandler, ValidationError, model_serializer, model_validator
 
 from shared.config import Section
 from shared.errors import SaccadeError
@@ -71,6 +71,16 @@ class TrainingConfig(Section):
     def steps(self, part: str) -> int:
         """Steps of one part."""
         return self.steps_extraction if self.is_extraction(part) else self.steps_ccn
+
+
+def settings_from(values: dict[str, Any]) -> TrainingConfig:
+    """The settings with these values. Raises SaccadeError that names the key."""
+    try:
+        return TrainingConfig.model_validate(values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
+        raise SaccadeError(f"training setting {key!r}: {first['msg']}: see training/settings.py") from error
 
 
 def load_settings(run_dir: Path) -> TrainingConfig:

@@ -85,7 +85,7 @@ class ExtractionTask:
 
     def __init__(self, config: TrainingConfig, views: list[ObjectViews], part: str, device: torch.device):
         torch.manual_seed(config.seed)
-        self.composer = FrameComposer(views, device)
+        self.composer = FrameComposer(views, device, config.seed)
         self.module = Extraction(len(views)).to(device, memory_format=torch.channels_last)
         self.config, self.device, self.lambdas = config, device, []
 
