@@ -1,4 +1,5 @@
-"""A run in one picture, from its log: the goal, the last view, and the table from above with what was believed."""
+"""A run in one picture, from its log: the goal, the last view, the table from above with what was believed, and the free
+energy."""
 
 from __future__ import annotations
 
@@ -21,15 +22,18 @@ from shared.recording import RunReader
 from shared.topics import BELIEF, FRAME, GOAL, PLAN, RESULT, TRUTH, Topic
 
 COLOURS = ("#d1495b", "#00798c", "#edae49", "#7b2d8b", "#3a7d44", "#2e4057", "#f26419", "#66a182")
-INCHES, DPI = (15.0, 5.2), 100
+INCHES, DPI = (21.0, 5.2), 100
 SHOWN_M = 0.62  # half the side of the view from above: the table and the camera's workspace
 PRESENT_ABOVE = 0.5
+F_TERMS = {"f_identity": "#264653", "f_position": "#2a9d8f", "f_crop": "#8ab17d", "f_pose": "#bcb8b1",
+           "f_likelihood": "#e0ddd6"}  # in other colours than the objects'
 TOLD = (GOAL, FRAME, BELIEF, TRUTH, PLAN, RESULT)
 
 
 @dataclass
 class Story:
-    """What the messages of one episode tell: images [H, W, 3], and the camera's position at each step [3]."""
+    """What the messages of one episode tell: images [H, W, 3], and for each step the camera's position [3] and the terms
+    of F summed over the objects [5], nats."""
 
     episode: int
     goal_rgb: NDArray[np.uint8] | None = None
@@ -38,6 +42,7 @@ class Story:
     last_step: int = 0  # of `last_rgb`: the last move has no view of its own
     ways: dict[int, NDArray[np.float64]] = field(default_factory=dict)
     beliefs: dict[str, Belief] = field(default_factory=dict)
+    energies: dict[int, NDArray[np.float64]] = field(default_factory=dict)
     truth: Truth | None = None
     plan: Plan | None = None
     result: Result | None = None
@@ -55,6 +60,8 @@ class Story:
             self.last_rgb, self.last_step = message.rgb, message.step
         elif topic == BELIEF:
             self.beliefs[part] = message
+            terms = np.array([getattr(message, name) for name in F_TERMS])
+            self.energies[message.step] = self.energies.get(message.step, 0.0) + terms
         elif topic == TRUTH:
             self.truth = message
         elif topic == PLAN:
@@ -96,12 +103,13 @@ def draw(log: Path, out: Path, episode: int | None = None) -> Story:
 
 
 def draw_story(story: Story, out: Path, *, dpi: int = DPI) -> None:
-    """Writes the picture of an episode as PNG: the goal, the last view, the table from above."""
+    """Writes the picture of an episode as PNG: the goal, the last view, the table from above, the free energy."""
     figure = new_figure(INCHES, dpi)
-    goal, view, above = figure.subplots(1, 3)
+    goal, view, above, energy = figure.subplots(1, 4, width_ratios=(1, 1, 1.35, 1))
     image(goal, story.goal_rgb, "goal" if story.goal_rgb is not None else "no goal: exploring")
     image(view, story.last_rgb, f"last view (step {story.last_step})")
     _from_above(above, story)
+    _free_energy(energy, story)
     figure.suptitle(_title(story))
     save(figure, out)
 
@@ -140,6 +148,16 @@ def _from_above(axes: Axes, story: Story) -> None:
                       label="goal's view", linestyle="none", zorder=4)
     way(axes, np.array(story.path_m))
     axes.legend(loc="center left", bbox_to_anchor=(1.02, 0.5), fontsize=8, frameon=False)
+
+
+def _free_energy(axes: Axes, story: Story) -> None:
+    """F of all objects at each step, by term."""
+    axes.set(title="free energy of all objects", xlabel="step", ylabel="F (nats)")
+    if story.energies:
+        steps = sorted(story.energies)
+        terms = np.array([story.energies[step] for step in steps]).T
+        axes.stackplot(steps, terms, labels=[name.removeprefix("f_") for name in F_TERMS], colors=list(F_TERMS.values()))
+        axes.legend(fontsize=8, frameon=False)
 
 
 def table_from_above(axes: Axes, title: str) -> None:

@@ -66,7 +66,7 @@ def test_not_seeing_removes_what_was_in_view_and_nothing_else():
     in_view = ((pixels > 60) & (pixels < 420)).all(1)
     share = position.weights[in_view].sum()
     for _ in range(4):
-        position.missed(camera, np.array(INTRINSICS_PX), [], rng)
+        position.missed(position.visible(camera, np.array(INTRINSICS_PX), []), rng)
     pixels, _ = project(position.particles, camera, INTRINSICS_PX)
     left = position.weights[((pixels > 60) & (pixels < 420)).all(1)].sum()
     assert share > 0.03

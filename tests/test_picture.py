@@ -79,7 +79,7 @@ def test_picture_shows_the_beliefs_in_what_is_there_alone(tmp_path):
     draw(tmp_path / "run.mcap", tmp_path / "there.png")
     draw(tmp_path / "absent.mcap", tmp_path / "absent.png")
     with Image.open(tmp_path / "there.png") as picture:
-        assert picture.size == (1500, 520)
+        assert picture.size == (2100, 520)
     assert pixels_of(tmp_path / "there.png", COLOURS[0]) > 20
     assert pixels_of(tmp_path / "absent.png", COLOURS[0]) == 0
 

@@ -42,6 +42,14 @@ def test_the_pose_term_is_small_when_the_transition_foresaw_the_latent():
     assert pose_term(seen[1], seen[0], TRUE, Turning(1)) < 0.2 * pose_term(odd, seen[0], TRUE, Turning(1))
 
 
+def test_the_first_view_of_a_pose_surprises_as_the_standard_normal_has_it():
+    seen = percept(cameras()[0], latent=latent_of(0.3, 0.7))
+    normal = torch.distributions.Normal
+    expected = torch.distributions.kl_divergence(
+        normal(torch.tensor(seen.latent_mean), torch.tensor(seen.latent_std)), normal(0.0, 1.0)).sum()
+    assert pose_term(seen, None, TRUE, Turning(1)) == pytest.approx(float(expected), rel=1e-5)
+
+
 def test_position_surprise_falls_as_the_belief_sharpens():
     rng, surprises = np.random.default_rng(0), []
     position = PositionFilter(CONFIG, rng)

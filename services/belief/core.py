@@ -64,12 +64,13 @@ class BeliefFilter:
     def _update(self, name: str, percepts: dict[str, Percept], present: set[str]) -> Belief:
         percept, position = percepts[name], self.positions[name]
         rng = self._rng(percept.step, name)
-        before, prior = position.moments(), position.presence
+        others = [(evidence_of(percepts[other]), self.radius_m[other]) for other in sorted(present - {name})]
+        visible = position.visible(percept.world_from_camera, percept.intrinsics_px, others)
+        before, prior = position.moments(), position.expected(visible)
         if name in present:
             position.seen(percept, rng)
         else:
-            others = [(evidence_of(percepts[other]), self.radius_m[other]) for other in sorted(present)]
-            position.missed(percept.world_from_camera, percept.intrinsics_px, others, rng)
+            position.missed(visible, rng)
         mean, covariance = position.moments()
         goal_view = self.goal_views.get(name)
         if goal_view and name in present and np.trace(covariance) < LOCALISED_M ** 2:
@@ -93,10 +94,8 @@ class BeliefFilter:
             return terms
         last, name = self.last_seen.get(percept.object), percept.object
         self.last_seen[name] = percept
-        terms |= {"f_crop": crop_term(percept, before), "f_likelihood": likelihood_term(percept)}
-        if last is not None:
-            terms["f_pose"] = pose_term(percept, last, after[0], self.transitions[name])
-        return terms
+        return terms | {"f_crop": crop_term(percept, before), "f_likelihood": likelihood_term(percept),
+                        "f_pose": pose_term(percept, last, after[0], self.transitions[name])}
 
 
 def build(config: Config) -> BeliefFilter:

@@ -16,12 +16,12 @@ from shared.messages import Percept
 
 Array = NDArray[np.float64]
 
-PIXEL_STD = 0.25  # of a crop's colours around their reconstruction
+PIXEL_STD = 1.0  # of a crop's colours around their reconstruction: the paper's likelihood is the squared error
 FLOOR = 1e-3
 
 
 def identity_term(presence: float, prior: float) -> float:
-    """KL[Q(i | o) || P(i)] of Bernoulli variables, nats."""
+    """KL[Q(i | o) || P(i)] of Bernoulli variables, nats; `prior`: that the object was expected in this view."""
     p, q = (float(np.clip(x, FLOOR, 1 - FLOOR)) for x in (presence, prior))
     return p * np.log(p / q) + (1 - p) * np.log((1 - p) / (1 - q))
 
@@ -61,15 +61,17 @@ def crop_term(percept: Percept, before: tuple[Array, Array]) -> float:
 
 
 @torch.inference_mode()
-def pose_term(percept: Percept, before: Percept, center: Array, transition: Transition) -> float:
+def pose_term(percept: Percept, before: Percept | None, center: Array, transition: Transition) -> float:
     """KL[Q(p | o) || P(p | p_before, a)]: the latent as seen, against the one before moved by the camera's displacement
-    around the object at `center` [3]."""
+    around the object at `center` [3]; against a standard normal where there is none."""
+    seen = torch.from_numpy(np.array(percept.latent_mean)), torch.from_numpy(np.array(percept.latent_std))
+    if before is None:
+        return float(kl_divergence(*seen, 0.0, 1.0))
     azimuth, elevation, _ = spherical(percept.world_from_camera[:3, 3], center)
     azimuth_0, elevation_0, _ = spherical(before.world_from_camera[:3, 3], center)
     displacement = torch.tensor([[float(wrap(azimuth - azimuth_0)), float(elevation - elevation_0)]])
     mean, std = transition(torch.from_numpy(np.array(before.latent_mean))[None], displacement)
-    return float(kl_divergence(torch.from_numpy(np.array(percept.latent_mean)),
-                               torch.from_numpy(np.array(percept.latent_std)), mean[0], std[0]))
+    return float(kl_divergence(*seen, mean[0], std[0]))
 
 
 def likelihood_term(percept: Percept) -> float:

@@ -97,11 +97,17 @@ class PositionFilter:
         odds = percept.presence / max(1.0 - percept.presence, 1e-3)
         self.log_odds = min(self.log_odds + np.log(max(odds, 1e-3)), 8.0)
 
-    def missed(self, camera: Array, intrinsics_px: Array, seen: list[tuple[Evidence, float]],
-               rng: np.random.Generator) -> None:
-        """Negative evidence: particles in view, not behind an object that is `seen` (with its radius, m), lose."""
+    def visible(self, camera: Array, intrinsics_px: Array, others: list[tuple[Evidence, float]]) -> NDArray[np.bool_]:
+        """Which particles [N] are in view and not behind one of the `others` that are seen (with their radii, m)."""
         hide = behind if self.config.hidden == "outlines" else beyond_nearest
-        visible = in_view(self.particles, camera, intrinsics_px) & ~hide(self.particles, camera[:3, 3], seen)
+        return in_view(self.particles, camera, intrinsics_px) & ~hide(self.particles, camera[:3, 3], others)
+
+    def expected(self, visible: NDArray[np.bool_]) -> float:
+        """Probability that the object is seen, by the particles that are `visible` [N]."""
+        return self.presence * float(self.weights[visible].sum())
+
+    def missed(self, visible: NDArray[np.bool_], rng: np.random.Generator) -> None:
+        """Negative evidence: the object is not seen, so the particles that are `visible` [N] lose."""
         share = float(self.weights[visible].sum())
         self._reweigh(np.where(visible, self.config.missed_weight, 1.0), rng)
         self.log_odds = max(self.log_odds + np.log(max(1.0 - share * (1.0 - self.config.missed_weight), 1e-3)), -8.0)
