@@ -1,5 +1,5 @@
-"""A run in one picture, from its log: the goal, the last view, the table from above with what was believed, and the free
-energy."""
+"""A run in one picture, from its log: the goal, the last view, the table from above with what was believed, and
+the free energy."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ TOLD = (GOAL, FRAME, BELIEF, TRUTH, PLAN, RESULT)
 
 @dataclass
 class Story:
-    """What the messages of one episode tell: images [H, W, 3], and for each step the camera's position [3] and the terms
-    of F summed over the objects [5], nats."""
+    """What the messages of one episode tell: images [H, W, 3], and for each step the camera's position [3] and the
+    terms of F summed over the objects [5], nats."""
 
     episode: int
     goal_rgb: NDArray[np.uint8] | None = None
@@ -156,7 +156,8 @@ def _free_energy(axes: Axes, story: Story) -> None:
     if story.energies:
         steps = sorted(story.energies)
         terms = np.array([story.energies[step] for step in steps]).T
-        axes.stackplot(steps, terms, labels=[name.removeprefix("f_") for name in F_TERMS], colors=list(F_TERMS.values()))
+        labels = [name.removeprefix("f_") for name in F_TERMS]
+        axes.stackplot(steps, terms, labels=labels, colors=list(F_TERMS.values()))
         axes.legend(fontsize=8, frameon=False)
 
 

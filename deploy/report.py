@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 from rich.console import Console
@@ -33,7 +34,8 @@ def report(paths: Sequence[Path], out: Path, *, failures: bool = False, reruns: 
         raise SaccadeError("no results are given: name files that `saccade bench` has written")
     files = labelled([read_results(path) for path in paths])
     (out / FOLDER).mkdir(parents=True, exist_ok=True)
-    lines = ["# Results", "", *origins(files), *success_and_errors(files), *plots(files, out), *conduct(files)]
+    lines = ["# Results", "", *origins(files), *success_and_errors(files), *side_by_side(files), *plots(files, out),
+             *conduct(files)]
     with tempfile.TemporaryDirectory() as folder:
         again = _again(files, Path(folder), weights) if reruns or failures else {}
         if reruns:
@@ -115,6 +117,49 @@ def _paper_cells(figures: Figures | None) -> list[str]:
         return ["-"] * (1 + len(MEASURES))
     errors = [f" ± {error:.3f}" for error in figures.errors] if figures.errors else [""] * len(figures.means)
     return [f"{figures.success_percent:.1f}", *(f"{m:.3f}{e}" for m, e in zip(figures.means, errors, strict=True))]
+
+
+def side_by_side(files: Sequence[Results]) -> list[str]:
+    """For files of the same scenes: what is different in each, and scene by scene what it did to success. The first
+    file is what the others are compared with."""
+    groups: dict[str, list[Results]] = {}
+    for file in files:
+        groups.setdefault(file.facts["scenes"]["sha256"], []).append(file)
+    lines = []
+    for base, *others in groups.values():
+        if not others:
+            continue
+        lines += [f"## Side by side: {base.suite}", "",
+                  "Gained and lost: scenes solved that the first does not solve, and the other way round.", "",
+                  "| results | differs in | success (%) | gained, lost | " + " | ".join(MEASURES.values())
+                  + " | median steps | mean steps |", "| --- | --- | ---: | ---: |" + " ---: |" * (len(MEASURES) + 2)]
+        solved = {r["scene"] for r in base.records if r["success"]}
+        for file in (base, *others):
+            row, mine = rows(file.records)[-1], {r["scene"] for r in file.records if r["success"]}
+            shared = {r["scene"] for r in base.records} & {r["scene"] for r in file.records}
+            change = "-" if file is base else f"+{len((mine - solved) & shared)}, -{len((solved - mine) & shared)}"
+            lines.append(f"| {file.path.stem} | {', '.join(differences(base, file)) or '-'} | "
+                         f"{100 * row.success.value:.1f} | {change} | " + " | ".join(map(_mean, row.means))
+                         + f" | {row.median_steps:g} | {fmean(r['steps'] for r in file.records):.1f} |")
+        lines.append("")
+    return lines
+
+
+def differences(base: Results, other: Results) -> list[str]:
+    """What another run was told differently: the agent, the weights, or keys of the configuration."""
+    found = [] if base.agent == other.agent else [f"agent {other.agent}"]
+    mine, theirs = (_flat({k: v for k, v in f.facts["config"].items() if k not in ("scene", "bus")})
+                    for f in (base, other))
+    found += [f"{key}={theirs[key]}" for key in theirs if key in mine and theirs[key] != mine[key]]
+    changed = base.facts["weights"] != other.facts["weights"] and base.agent == other.agent
+    return found + ["weights"] * (changed and not any(f.startswith("perception.weights") for f in found))
+
+
+def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    result: dict[str, Any] = {}
+    for key, value in tree.items():
+        result |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+    return result
 
 
 def plots(files: Sequence[Results], out: Path) -> list[str]:

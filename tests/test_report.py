@@ -14,7 +14,7 @@ from rich.console import Console
 from deploy.bench import bench, prepare
 from deploy.failures import CLASSES, Diagnosis, Distance, diagnose, section
 from deploy.picture import Story
-from deploy.report import report
+from deploy.report import report, side_by_side
 from deploy.report_pictures import draw_exploration, explore, pick
 from deploy.rerun import prepare_again, read_results, replay, same_as
 from shared.config import Config
@@ -69,6 +69,18 @@ def test_numbers_and_pictures_of_a_small_file(tmp_path):
         assert f"(report/{name}.png)" in text
         with Image.open(tmp_path / "out" / "report" / f"{name}.png") as picture:
             assert min(picture.size) > 100
+
+
+def test_runs_of_the_same_scenes_are_compared_one_by_one(tmp_path):
+    """The second, with a configuration of its own, loses scene b and gains scene c; another suite is not compared."""
+    base = write(tmp_path / "base.json", [record("a"), record("b"), record("c", False)])
+    changed = Config().with_values({"belief.pose": "last", "seed": 0}).model_dump(mode="json")
+    other = write(tmp_path / "last.json", [record("a"), record("b", False), record("c")], config=changed)
+    apart = write(tmp_path / "apart.json", [record("d")], scenes={"suite": "yaw-500", "file": "t.json", "sha256": "ee"})
+    lines = side_by_side([read_results(path) for path in (base, other, apart)])
+    row = next(line for line in lines if line.startswith("| last"))
+    assert row.startswith("| last | belief.pose=last | 66.7 | +1, -1 |")
+    assert sum(line.startswith("| ") for line in lines) == 4  # two headers, two files
 
 
 def test_files_that_are_no_results_are_said_in_one_line(tmp_path):
