@@ -69,7 +69,7 @@ class PaperExtractionTask:
         batch = self.frames.compose(second, generator)
         expected = self._expected(first, second, generator)
         with torch.autocast(self.device.type, dtype=torch.bfloat16):
-            return loss_l2(self.module, self.ccn, batch, self.clean.clean(second), expected, self.config.kl_extraction)
+            return loss_l2(self.module, self.ccn, batch, self.clean.clean(second), expected, self.config)
 
     @torch.no_grad()
     def _expected(self, first: Tensor, second: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
@@ -98,10 +98,10 @@ class PaperExtractionTask:
 
 
 def loss_l2(network: PaperExtraction, ccn: CCN, batch: FrameBatch, clean: Tensor, expected: tuple[Tensor, Tensor],
-            kl_weight: float) -> tuple[Tensor, dict[str, float]]:
+            config: TrainingConfig) -> tuple[Tensor, dict[str, float]]:
     """The masking, cropping and identification errors, and the KL terms of the latent that the crop gives: against the
     one `expected` after a displacement, and against a standard normal. What is not seen has neither crop nor latent."""
-    mask, _, _, crop, logit = network(batch.image.contiguous(memory_format=torch.channels_last))
+    mask, center, scale, crop, logit = network(batch.image.contiguous(memory_format=torch.channels_last))
     visible = batch.visible[:, 0]
     seen = (visible > SEEN).float()
     clear = ((visible > SEEN) | (visible < HIDDEN)).float()
@@ -115,6 +115,8 @@ def loss_l2(network: PaperExtraction, ccn: CCN, batch: FrameBatch, clean: Tensor
     mean, std = ccn.encoder(crop[:, :3])
     kl_move = mean_of_seen(kl_divergence(mean, std, *expected))
     kl_prior = mean_of_seen(kl_divergence(mean, std, 0.0, 1.0))
-    loss = MASKING * masking + CROPPING * cropping + IDENTIFICATION * identification + kl_weight * (kl_move + kl_prior)
+    error = (center - (2 * batch.center[:, 0] - 1)).abs().sum(1) + (scale.log() - batch.log_scale[:, 0]).abs()
+    loss = (MASKING * masking + CROPPING * cropping + IDENTIFICATION * identification
+            + config.kl_extraction * (kl_move + kl_prior) + config.guide_extraction * mean_of_seen(error))
     return loss, {"mask": float(masking.detach()), "crop": float(cropping.detach()),
                   "presence": float(identification.detach()), "kl": float(kl_move.detach())}

@@ -22,7 +22,9 @@ class TrainingConfig(Section):
     """`names`: objects that the networks shall know. `steps_*`: optimisation steps of the two phases.
 
     `architecture` "paper": the paper's own networks, trained as it says; some settings then have other defaults.
-    `kl_extraction`: weight of the two KL terms in its phase 2. Neither is written where the architecture is "default".
+    `kl_extraction`: weight of the two KL terms in its phase 2; `guide_extraction`: of the error of centre and scale
+    themselves, which the paper leaves to the crop's error alone: with it fewer steps find the object. None of the
+    three is written where the architecture is "default".
     """
 
     objects: Literal["pantry", "ycb"] = "pantry"
@@ -39,6 +41,7 @@ class TrainingConfig(Section):
     device: Literal["auto", "cpu", "cuda"] = "auto"
     architecture: Architecture = "default"
     kl_extraction: float = Field(1.0, ge=0)
+    guide_extraction: float = Field(0.0, ge=0)
 
     @model_validator(mode="before")
     @classmethod
@@ -49,7 +52,7 @@ class TrainingConfig(Section):
     def _tree(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
         tree = handler(self)
         if self.architecture == "default":
-            del tree["architecture"], tree["kl_extraction"]
+            del tree["architecture"], tree["kl_extraction"], tree["guide_extraction"]
         return tree
 
     @property
