@@ -83,7 +83,7 @@ class PlannerConfig(Section):
     replan_every: int = Field(10, ge=1)
     step_m: float = Field(0.05, gt=0, le=0.5)
     range_std_m: float = Field(0.025, gt=0)
-    goal_confidence: float = Field(0.2, ge=0, le=1)  # below it the goal image says nothing
+    goal_confidence: float = Field(0.7, ge=0, le=1)  # below it the goal image says nothing
     goal_pixel: bool = True  # the target is brought to where the goal image shows it, not to the centre
     retry: bool = True  # a view that was not the goal's is left for another
     information_weight: float = Field(1.0, ge=0)

@@ -28,10 +28,16 @@ def strangers(known: list[ObjectViews], rng: np.random.Generator, count: int = 6
 
 
 def texture(rng: np.random.Generator, side_px: int) -> Array:
-    """A random texture [side_px, side_px, 3] in [0, 1]: packaging, or bands of colours, a mosaic, clouds, or noise."""
+    """A random texture [side_px, side_px, 3] in [0, 1]: packaging, or bands of colours, a mosaic, clouds, or noise, some
+    of them faint."""
     kind = rng.choice(5, p=(0.2, 0.1, 0.1, 0.1, 0.5))
     if kind == 4:
         return _packaging(rng, side_px)
+    strength = 1.0 if rng.random() < 0.7 else rng.random()
+    return rng.random(3) * (1 - strength) + strength * _pattern(rng, side_px, kind)
+
+
+def _pattern(rng: np.random.Generator, side_px: int, kind: int) -> Array:
     if kind == 0:
         x, _ = _plane(rng, side_px)
         bands = rng.random((int(rng.integers(1, 9)), 3))
