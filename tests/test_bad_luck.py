@@ -92,14 +92,45 @@ def test_an_absent_target_is_never_declared(agent, world, scenes):
     assert np.linalg.norm(eyes.max(0) - eyes.min(0)) > 0.3
 
 
-@pytest.mark.parametrize("image", ["black", "white", "grey"])
+def grey(shade):
+    return np.full((480, 480, 3), shade, np.uint8)
+
+
+def unknown(mesh_name, side_px=64):
+    """The goal image of an object of a known shape, with a label that no network has seen."""
+    mesh, rng = load_mesh("pantry", mesh_name), np.random.default_rng(7)
+    label = np.kron(rng.integers(0, 256, (8, 5, 3)), np.ones((side_px, side_px, 1))).astype(np.uint8)
+    other = World((replace(mesh, texture=label),))
+    other.place({mesh.name: (np.array([0.0, 0.0, mesh.size_m[2] / 2]), 0.4)}, (0.3, 0.5, 0.2))
+    image = other.render(look_at(np.array([0.25, 0.2, 0.3]), np.array([0.0, 0.0, 0.08])))
+    other.close()
+    return image
+
+
+PICTURES = {
+    "black": lambda: grey(0), "white": lambda: grey(255), "grey": lambda: grey(120),
+    "noise": lambda: np.random.default_rng(0).integers(0, 256, (480, 480, 3), np.uint8),
+    "stripes": lambda: np.repeat(((np.arange(480) // 16 % 2) * 255).astype(np.uint8), 480 * 3).reshape(480, 480, 3),
+    "unknown can": lambda: unknown("soup_can"), "unknown box": lambda: unknown("cereal_box"),
+}
+
+
+@pytest.mark.parametrize("image", PICTURES)
 def test_a_goal_image_of_nothing_known_gives_low_confidence_and_no_arrival(agent, world, scenes, image):
     """What the image shows is no known object: the agent says so by its confidence, explores, and does not crash."""
-    picture = np.full((480, 480, 3), {"black": 0, "white": 255, "grey": 120}[image], np.uint8)
-    told = play(agent, world, scenes[0], max_steps=12, goal_rgb=picture)
-    assert last(told, "plan").goal_confidence < 0.2
+    told = play(agent, world, scenes[0], max_steps=12, goal_rgb=np.ascontiguousarray(PICTURES[image]()))
+    assert last(told, "plan").goal_confidence < CONFIG.planner.goal_confidence
     assert last(told, "plan").target == ""
     assert not last(told, "result").declared
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_goal_image_of_a_known_object_is_believed(agent, world, scenes, name):
+    """The other side: the threshold keeps nothing known out."""
+    for scene in (s for s in scenes if s.target == name):
+        told = play(agent, world, scene, max_steps=1)
+        assert last(told, "plan").goal_confidence > 0.95
+        assert last(told, "plan").target == name
 
 
 def test_exploring_finds_what_is_there(agent, world, scenes):

@@ -67,7 +67,7 @@ class PaperExtractionTask:
         generator, count = self.generator(step), self.config.batch_extraction
         first, second = (self._pick(self.train_index, count, generator) for _ in range(2))
         batch = self.frames.compose(second, generator)
-        expected = self._expected(first, second, generator)
+        expected = self._expected(first, second, generator) if self.config.kl_extraction else None
         with torch.autocast(self.device.type, dtype=torch.bfloat16):
             return loss_l2(self.module, self.ccn, batch, self.clean.clean(second), expected, self.config)
 
@@ -97,8 +97,8 @@ class PaperExtractionTask:
         draw_paper_extraction(path, self.module, self.frames.compose(chosen, generator), self.clean.clean(chosen))
 
 
-def loss_l2(network: PaperExtraction, ccn: CCN, batch: FrameBatch, clean: Tensor, expected: tuple[Tensor, Tensor],
-            config: TrainingConfig) -> tuple[Tensor, dict[str, float]]:
+def loss_l2(network: PaperExtraction, ccn: CCN, batch: FrameBatch, clean: Tensor,
+            expected: tuple[Tensor, Tensor] | None, config: TrainingConfig) -> tuple[Tensor, dict[str, float]]:
     """The masking, cropping and identification errors, and the KL terms of the latent that the crop gives: against the
     one `expected` after a displacement, and against a standard normal. What is not seen has neither crop nor latent."""
     mask, center, scale, crop, logit = network(batch.image.contiguous(memory_format=torch.channels_last))
@@ -112,11 +112,12 @@ def loss_l2(network: PaperExtraction, ccn: CCN, batch: FrameBatch, clean: Tensor
     masking = F.mse_loss(mask, batch.mask)
     cropping = mean_of_seen(((crop[:, :3].float() - clean) ** 2).mean((1, 2, 3)))
     identification = (F.binary_cross_entropy_with_logits(logit, seen, reduction="none") * clear).mean()
-    mean, std = ccn.encoder(crop[:, :3])
-    kl_move = mean_of_seen(kl_divergence(mean, std, *expected))
-    kl_prior = mean_of_seen(kl_divergence(mean, std, 0.0, 1.0))
     error = (center - (2 * batch.center[:, 0] - 1)).abs().sum(1) + (scale.log() - batch.log_scale[:, 0]).abs()
     loss = (MASKING * masking + CROPPING * cropping + IDENTIFICATION * identification
-            + config.kl_extraction * (kl_move + kl_prior) + config.guide_extraction * mean_of_seen(error))
-    return loss, {"mask": float(masking.detach()), "crop": float(cropping.detach()),
-                  "presence": float(identification.detach()), "kl": float(kl_move.detach())}
+            + config.guide_extraction * mean_of_seen(error))
+    parts = {"mask": masking, "crop": cropping, "presence": identification}
+    if expected is not None:
+        mean, std = ccn.encoder(crop[:, :3])
+        parts["kl"] = mean_of_seen(kl_divergence(mean, std, *expected))
+        loss = loss + config.kl_extraction * (parts["kl"] + mean_of_seen(kl_divergence(mean, std, 0.0, 1.0)))
+    return loss, {name: float(value.detach()) for name, value in parts.items()}

@@ -16,7 +16,7 @@ from shared.generative_model import CROP_PX
 from training.crops import REFERENCE_SHELL, warp
 from training.frames import FrameBatch
 
-SCALES = (0.283, 4.0)  # 0.40 m / range, of every object in an image; the paper does not say how it is distributed
+SCALES = (0.283, 4.0)  # 0.40 m / range, of every object in an image; the ranges are even, which the paper leaves open
 EMPTY = 0.3  # share of the images without the object
 LEVELS = 4  # of the tile pyramid: 128, 64, 32, 16 pixels
 SAMPLES = 4  # per pixel of a clean view and direction, so that a tile made smaller does not flicker
@@ -138,9 +138,9 @@ def _in_image(tiles: Tensor, side_m: float) -> Tensor:
 
 
 def _place(count: int, uniform: Uniform) -> tuple[Tensor, Tensor]:
-    """Centres [B, 2] anywhere in the image ([-1, 1]) and scales [B]: no factor of distance is likelier than another."""
-    low, high = (math.log(scale) for scale in SCALES)
-    return uniform(count, 2) * 2 - 1, (low + (high - low) * uniform(count)).exp()
+    """Centres [B, 2] anywhere in the image ([-1, 1]) and scales [B] of ranges that are even between their limits."""
+    far, near = (1 / scale for scale in SCALES)
+    return uniform(count, 2) * 2 - 1, 1 / (near + (far - near) * uniform(count))
 
 
 def _backgrounds(count: int, uniform: Uniform) -> Tensor:

@@ -28,7 +28,7 @@ def strangers(known: list[ObjectViews], rng: np.random.Generator, count: int = 6
 
 
 def texture(rng: np.random.Generator, side_px: int) -> Array:
-    """A random texture [side_px, side_px, 3] in [0, 1]: packaging, or bands of colours, a mosaic, clouds, or noise, some
+    """A random texture [side_px, side_px, 3] in [0, 1]: packaging, or bands of colours, a mosaic, clouds, noise, some
     of them faint."""
     kind = rng.choice(5, p=(0.2, 0.1, 0.1, 0.1, 0.5))
     if kind == 4:
