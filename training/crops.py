@@ -15,6 +15,7 @@ from torch import Tensor
 
 from services.simulator.views import ObjectViews
 from shared.generative_model import CROP_PX
+from training.strangers import strangers
 
 REFERENCE_SHELL = 2  # index of the paper's 0.40 m among the shells
 
@@ -46,12 +47,14 @@ class CropBatch:
 
 
 class CropComposer:
-    """Composes crops of `views` with `others` as clutter. All randomness comes from the generator of each call."""
+    """Composes crops of `views` with `others` and strangers as clutter, the strangers drawn once from `seed`. All other
+    randomness comes from the generator of each call."""
 
-    def __init__(self, views: ObjectViews, others: list[ObjectViews], device: torch.device):
+    def __init__(self, views: ObjectViews, others: list[ObjectViews], device: torch.device, seed: int = 0):
         self.views, self.device = views, device
-        self.tiles = [_half_tiles(v).to(device) for v in [views, *others]]
-        self.side_m = torch.tensor([v.crop_side_m for v in [views, *others]], device=device)
+        everything = [views, *others, strangers([views, *others], seed)]
+        self.tiles = [_half_tiles(v).to(device) for v in everything]
+        self.side_m = torch.tensor([v.crop_side_m for v in everything], device=device)
         self.azimuth = torch.as_tensor(views.azimuth_rad, dtype=torch.float32, device=device)
         self.elevation = torch.as_tensor(views.elevation_rad, dtype=torch.float32, device=device)
 
@@ -95,8 +98,9 @@ class CropComposer:
         return self.tiles[which][shell, index].float() / 255.0
 
     def _clutter(self, count: int, uniform, *, near: Tensor, rare: bool) -> Tensor:
-        """Another object's view [B, 4, 64, 64] somewhere in the crop, or nothing; near the centre where `near`."""
-        which = (uniform(count) * (len(self.tiles) - 1)).long() + 1
+        """Another object's view [B, 4, 64, 64] somewhere in the crop, or nothing; near the centre where `near`. A
+        stranger is twice as frequent as any other object."""
+        which = (uniform(count) * len(self.tiles)).long().add(1).clamp(max=len(self.tiles) - 1)
         result = torch.zeros(count, 4, CROP_PX, CROP_PX, device=self.device)
         offset = (uniform(count, 2) * 2 - 1) * torch.where(near, 0.25, 1.5)[:, None]
         scale = ((uniform(count) * 2 - 1) * 0.4).exp()

@@ -30,7 +30,6 @@ from shared.geometry import (
 from training.strangers import strangers, texture
 
 LEVELS = 4  # of the tile pyramid: 128, 64, 32, 16 pixels
-STRANGERS = 1  # key of their randomness
 GOAL_LIKE = 0.25  # share of images as goals show them: one object, from any elevation alike
 STRANGE_GOAL = 0.25  # share of these with an object that nobody knows,
 STRANGE = (0.65, 0.25, 0.10)  # and of the others with none, one and two of them
@@ -71,7 +70,7 @@ class FrameComposer:
 
     def __init__(self, known: list[ObjectViews], device: torch.device, seed: int = 0):
         self.known, self.device = len(known), device
-        self.views = [*known, strangers(known, np.random.default_rng([seed, STRANGERS]))]
+        self.views = [*known, strangers(known, seed)]
         self.pyramid = [_pyramid(v, device) for v in self.views]
         self.coverage = [torch.as_tensor(v.tiles[..., 3].mean((2, 3)) / 255.0) for v in known]  # [S, N]
         self.directions = [direction(v.azimuth_rad, v.elevation_rad) for v in self.views]

@@ -14,14 +14,16 @@ from shared.geometry import REFERENCE_RANGE_M, fibonacci_hemisphere
 
 Array = NDArray[np.float64]
 
+KEY = 1  # of their randomness
 CROP_SIDE_M = 0.25
 SIZE_M = np.array([0.12, 0.12, 0.14])
 OTHER_COLOUR = 0.12  # a known object whose colours differ less from its own, on average, is still itself
 
 
-def strangers(known: list[ObjectViews], rng: np.random.Generator, count: int = 600) -> ObjectViews:
+def strangers(known: list[ObjectViews], seed: int, count: int = 600) -> ObjectViews:
     """Tiles of `count` unknown things as one object's views from 0.40 m. A third wear a known object's shape, a third
     of these its texture in other colours."""
+    rng = np.random.default_rng([seed, KEY])
     azimuth, elevation = fibonacci_hemisphere(count)
     tiles = np.stack([_tile(known, rng) for _ in range(count)])[None]
     return ObjectViews("stranger", tiles, (REFERENCE_RANGE_M,), azimuth, elevation, CROP_SIDE_M, SIZE_M)

@@ -40,15 +40,16 @@ class CcnTask:
 
     def __init__(self, config: TrainingConfig, views: list[ObjectViews], part: str, device: torch.device):
         torch.manual_seed(config.seed)
+        self.config = config
         mine = next(v for v in views if v.name == part)
         self.composer = self._composer(mine, [v for v in views if v.name != part], device)
         self.train_index, self.held_out = split(mine, config.seed, device)
         self.module = nn.ModuleDict(self._networks()).to(device, memory_format=torch.channels_last)
         self.ccn = self.module["ccn"]
-        self.config, self.device, self.lambdas, self.part = config, device, [80.0] * 3, part
+        self.device, self.lambdas, self.part = device, [80.0] * 3, part
 
     def _composer(self, mine: ObjectViews, others: list[ObjectViews], device: torch.device):
-        return CropComposer(mine, others, device)
+        return CropComposer(mine, others, device, self.config.seed)
 
     def _networks(self) -> dict[str, nn.Module]:
         return {"ccn": CCN(), "identity": Identity()}
