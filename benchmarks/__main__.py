@@ -1,7 +1,8 @@
 """`python -m benchmarks`: how cost grows, as ratios measured in one run, so that they mean the same on any machine.
 
-Perception: K objects against K times one. Planning: 5,000 candidates against a plain loop, and 500 to 50,000. Wire: a
-frame encoded and decoded against copying its pixels. Each figure is the median of several repetitions, one thread.
+Perception: K objects against K times one, and against what the processor could do: the time that as many operations
+take in a large matrix product. Planning: 5,000 candidates against a plain loop, and 500 to 50,000. Wire: a frame
+encoded and decoded against copying its pixels. Each figure is the median of several repetitions, one thread.
 """
 
 from __future__ import annotations
@@ -16,8 +17,10 @@ import numpy as np
 import torch
 from rich.console import Console
 from rich.table import Table
+from torch.utils.flop_counter import FlopCounterMode
 
 from services.perception.core import SceneCCN
+from services.perception.seen import Seen
 from services.planner.free_energy import expected_free_energy
 from services.planner.goal import Preference
 from shared.config import REPOSITORY
@@ -39,7 +42,8 @@ def milliseconds(work: Callable[[], object], repetitions: int = 9) -> float:
 
 
 def perception() -> list[dict]:
-    """The CCN encoders of K objects in one call, against a loop over them; and all of perception for 1 to 5 objects."""
+    """The CCN encoders of K objects in one call, against a loop over them; and all of perception for K objects, where
+    more than the five that there are weights for are the same again."""
     rows, one = [], 0.0
     for count in (1, 2, 5, 10, 20):
         stacked = Stacked([Encoder() for _ in range(count)])
@@ -49,15 +53,27 @@ def perception() -> list[dict]:
         one = one or together
         rows.append({"what": f"encode {count} objects", "ms": together, "of a loop": together / looped,
                      f"of {count} x one": together / (count * one)})
-    weights, one = Weights(REPOSITORY / "weights" / "pantry"), 0.0
+    weights, one, rate = Weights(REPOSITORY / "weights" / "pantry"), 0.0, operations_per_ms()
     image = np.random.default_rng(0).integers(0, 256, (IMAGE_SIZE_PX, IMAGE_SIZE_PX, 3), dtype=np.uint8)
-    for count in (1, 2, 5):
-        model = SceneCCN(weights, weights.names[:count])
-        together = milliseconds(lambda m=model: m.see(image, INTRINSICS_PX, (0.0, 1.0, 0.0)))
+    for count in (1, 2, 5, 10, 20):
+        model = SceneCCN(weights, (weights.names * 4)[:count])
+
+        def see(m: SceneCCN = model) -> Seen:
+            return m.see(image, INTRINSICS_PX, (0.0, 1.0, 0.0))
+
+        together = milliseconds(see)
         one = one or together
-        rows.append({"what": f"perceive {count} objects", "ms": together,
-                     f"of {count} x one": together / (count * one)})
+        with FlopCounterMode(display=False) as counter:
+            see()
+        rows.append({"what": f"perceive {count} objects", "ms": together, f"of {count} x one": together / (count * one),
+                     "x the limit": together * rate / counter.get_total_flops()})
     return rows
+
+
+def operations_per_ms(side: int = 1024) -> float:
+    """Floating-point operations in a millisecond of a large matrix product: what the processor could do."""
+    a, b = torch.rand(side, side), torch.rand(side, side)
+    return 2 * side ** 3 / milliseconds(lambda: a @ b)
 
 
 def _belief(name: str, deviation: float, rng: np.random.Generator) -> Belief:
