@@ -19,6 +19,7 @@ from training.part import Trainer, pick_device
 from training.run import export, start, train
 from training.settings import EXTRACTION, TrainingConfig
 from training.strangers import recoloured
+from training.tasks import CcnTask
 
 NAMES = ("soup_can", "rice_box")
 TINY = TrainingConfig(objects="pantry", names=NAMES, views=24, steps_ccn=4, steps_extraction=4, batch_ccn=8,
@@ -67,6 +68,19 @@ def test_the_crops_say_where_the_object_is(finished):
     middle = (clean.sum(1) * rows).sum(1) / clean.sum((1, 2)) / 64 - 0.5
     label = batch.correction[seen, 0]
     assert torch.corrcoef(torch.stack([centre - middle, label]))[0, 1] > 0.9
+
+
+def test_clean_crops_are_the_views_themselves(finished):
+    """With crops "clean" what the CCN sees is what it shall draw, and all of it lies within its mask."""
+    views = [load_views(finished, name) for name in NAMES]
+    task = CcnTask(TINY.model_copy(update={"crops": "clean"}), views, NAMES[0], torch.device("cpu"))
+    batch = task.composer.undisturbed(torch.arange(5))
+    assert torch.equal(batch.rgb, batch.target)
+    assert float((batch.rgb.sum(1) * (batch.mask[:, 0] == 0)).sum()) < 0.01 * float(batch.rgb.sum())
+    assert 0.1 < float(batch.mask.mean()) < 0.7
+    clean, disturbed = (CcnTask(TINY.model_copy(update={"crops": crops}), views, NAMES[0], torch.device("cpu"))
+                        for crops in ("clean", "as_detected"))
+    assert clean.loss(0)[1]["first"] != disturbed.loss(0)[1]["first"]
 
 
 def test_the_composed_frames_agree_with_their_labels(finished):

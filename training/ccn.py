@@ -29,8 +29,9 @@ class Pair:
     displacement: Tensor
 
 
-def sample_pair(composer: CropComposer, train_index: Tensor, batch: int, generator: torch.Generator) -> Pair:
-    """Random pairs of the training directions, composed."""
+def sample_pair(composer: CropComposer, train_index: Tensor, batch: int, generator: torch.Generator, *,
+                clean: bool = False) -> Pair:
+    """Random pairs of the training directions, composed; or `clean`, as they were rendered."""
     def pick() -> Tensor:
         chosen = torch.randint(len(train_index), (batch,), generator=generator, device=composer.device)
         return train_index[chosen]
@@ -38,6 +39,8 @@ def sample_pair(composer: CropComposer, train_index: Tensor, batch: int, generat
     i, j = pick(), pick()
     azimuth = (composer.azimuth[j] - composer.azimuth[i] + np.pi) % (2 * np.pi) - np.pi
     displacement = torch.stack([azimuth, composer.elevation[j] - composer.elevation[i]], dim=1)
+    if clean:
+        return Pair(composer.undisturbed(i), composer.undisturbed(j), displacement)
     return Pair(composer.compose(i, generator), composer.compose(j, generator), displacement)
 
 

@@ -62,6 +62,13 @@ class CropComposer:
         """Clean views [B, 3, 64, 64] at the reference range."""
         return self.tiles[0][REFERENCE_SHELL, index, :3].float() / 255.0
 
+    def undisturbed(self, index: Tensor) -> CropBatch:
+        """The directions `index` [B] as they were rendered from the reference range, alone and whole."""
+        tile = self.tiles[0][REFERENCE_SHELL, index].float() / 255.0
+        whole = torch.ones(len(index), device=self.device)
+        return CropBatch(tile[:, :3], tile[:, 3:], whole.bool(), whole, torch.zeros(len(index), 3, device=self.device),
+                         tile[:, :3])
+
     def compose(self, index: Tensor, generator: torch.Generator, *, present: float = 1.0,
                 jitter: float = 1.0) -> CropBatch:
         """Crops of the directions `index` [B]; with probability 1 - `present` the object is not there."""

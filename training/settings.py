@@ -19,7 +19,8 @@ PAPER = {"steps_ccn": 5_000, "steps_extraction": 5_000, "batch_ccn": 150, "batch
 
 
 class TrainingConfig(Section):
-    """`names`: objects that the networks shall know. `steps_*`: optimisation steps of the two phases.
+    """`names`: objects that the networks shall know. `steps_*`: optimisation steps of the two phases. `crops`: what the
+    CCNs see, views as wrong as the detector's crops or, for comparison, as they were rendered.
 
     `architecture` "paper": the paper's own networks, trained as it says; some settings then have other defaults.
     `kl_extraction`: weight of the two KL terms in its phase 2; `guide_extraction`: of the error of centre and scale
@@ -39,6 +40,7 @@ class TrainingConfig(Section):
     rate_extraction: float = Field(2e-3, gt=0)
     checkpoint_every: int = Field(500, ge=1)
     device: Literal["auto", "cpu", "cuda"] = "auto"
+    crops: Literal["as_detected", "clean"] = "as_detected"
     architecture: Architecture = "default"
     kl_extraction: float = Field(1.0, ge=0)
     guide_extraction: float = Field(0.0, ge=0)

@@ -59,13 +59,19 @@ class CcnTask:
 
     def loss(self, step: int) -> tuple[Tensor, dict[str, float]]:
         generator, batch = self.generator(step), self.config.batch_ccn
+
+        def pick(count: int) -> Tensor:
+            chosen = torch.randint(len(self.train_index), (count,), generator=generator, device=self.device)
+            return self.train_index[chosen]
+
+        clean = self.config.crops == "clean"
         with torch.no_grad():
-            pair = sample_pair(self.composer, self.train_index, batch, generator)
-            chosen = torch.randint(len(self.train_index), (batch // 2,), generator=generator, device=self.device)
-            mixed = self.composer.compose(self.train_index[chosen], generator, present=0.25)
+            pair = sample_pair(self.composer, self.train_index, batch, generator, clean=clean)
+            mixed = self.composer.compose(pick(batch // 2), generator, present=0.25)
+            present = self.composer.compose(pick(batch), generator) if clean else pair.first
         with torch.autocast(self.device.type, dtype=torch.bfloat16):
             loss, parts = loss_l1(self.ccn, pair, self.lambdas, generator)
-            identity = sum(identity_loss(self.module["identity"], crops) for crops in (pair.first, mixed))
+            identity = sum(identity_loss(self.module["identity"], crops) for crops in (present, mixed))
         return loss + IDENTITY_WEIGHT * identity, {**parts, "identity": float(identity.detach())}
 
     def after(self, step: int, smoothed: dict[str, float]) -> None:
