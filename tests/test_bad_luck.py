@@ -7,14 +7,16 @@ import pytest
 
 from deploy.registry import agent_pairs
 from services.evaluator import core as evaluator
+from services.perception.core import SceneCCN
 from services.simulator.core import SERVICE, Simulator
 from services.simulator.objects import load_mesh, names_of
 from services.simulator.scenes import Placed, generate_split
 from services.simulator.world import World
-from shared.config import Config
+from shared.config import REPOSITORY, Config
 from shared.geometry import look_at
 from shared.loop import run_local
 from shared.task import START_RANGE_M, start_pose
+from shared.weights import Weights
 
 NAMES = names_of("pantry")
 CONFIG = Config().with_values({"scene.names": list(NAMES), "scene.objects": "pantry", "bus.kind": "local"})
@@ -131,6 +133,21 @@ def test_a_goal_image_of_a_known_object_is_believed(agent, world, scenes, name):
         told = play(agent, world, scene, max_steps=1)
         assert last(told, "plan").goal_confidence > 0.95
         assert last(told, "plan").target == name
+
+
+def test_objects_of_another_set_are_strangers(world):
+    """The networks of the YCB objects see the goals of 40 pantry scenes: nine of ten are no object of theirs."""
+    weights = Weights(REPOSITORY / "weights" / "ycb")
+    model = SceneCCN(weights, weights.names)
+    sizes = {name: load_mesh("pantry", name).size_m for name in NAMES}
+    surest = []
+    for scene in generate_split(sizes, seed=900, counts=(1,), repeats=8, yaw="random"):
+        target = scene.target_placed
+        world.place({target.name: (target.center_m, target.yaw_rad)}, scene.table_rgb)
+        seen = model.see(world.render(scene.goal_world_from_camera), world.intrinsics_px, (0.0, 1.0, 0.0))
+        surest.append(seen.presence.max())
+    assert len(surest) == 40
+    assert sum(presence > CONFIG.planner.goal_confidence for presence in surest) <= 4
 
 
 def test_exploring_finds_what_is_there(agent, world, scenes):
