@@ -18,7 +18,9 @@ from deploy.failures import failed_scenes, section
 from deploy.rerun import Again, Results, prepare_again, read_results, replay, same_as
 from deploy.table import MEASURES, PAPER, PAPER_AGENTS, PAPER_ROOM, TOTAL, Estimate, Figures, Row, milliseconds, rows
 from deploy.threads import enforce_one_thread
+from shared.config import validate
 from shared.errors import SaccadeError
+from shared.weights import Weights
 
 ORACLE = "oracle"
 REPORT_NAME, FAILURES_NAME, FOLDER = "report.md", "failures.md", "report"
@@ -35,7 +37,7 @@ def report(paths: Sequence[Path], out: Path, *, failures: bool = False, reruns: 
     files = labelled([read_results(path) for path in paths])
     (out / FOLDER).mkdir(parents=True, exist_ok=True)
     lines = ["# Results", "", *origins(files), *success_and_errors(files), *side_by_side(files), *plots(files, out),
-             *conduct(files)]
+             *conduct(files), *training(files)]
     with tempfile.TemporaryDirectory() as folder:
         again = _again(files, Path(folder), weights) if reruns or failures else {}
         if reruns:
@@ -187,6 +189,27 @@ def conduct(files: Sequence[Results]) -> list[str]:
         lines.append(f"| {file.label} | {row.median_steps:g} ({row.middle_steps[0]:g} to {row.middle_steps[1]:g}) | "
                      f"{100 * row.declared:.1f} | {rightly} | {100 * row.false_alarms:.1f} | {spent} |")
     return [*lines, ""]
+
+
+def training(files: Sequence[Results]) -> list[str]:
+    """What it took to train the weights, by their manifests; of those that are at hand, unchanged."""
+    lines: dict[Path, str] = {}
+    for file in files:
+        folder = validate(file.facts["config"], str(file.path)).weights
+        try:
+            weights = Weights(folder)
+        except SaccadeError:
+            continue
+        if weights.hashes == file.facts["weights"]:
+            facts = weights.manifest
+            steps = facts["training"]
+            lines[folder] = (f"| {folder.name} | {facts['where_trained']} | {facts['seconds'] / 3600:.1f} | "
+                             f"{steps['steps_ccn']:,} x {steps['batch_ccn']} | "
+                             f"{steps['steps_extraction']:,} x {steps['batch_extraction']} |")
+    head = ["## Training", "", "Hours are of one process; the networks of a set can be trained side by side.", "",
+            "| weights | where | hours | CCN: steps x batch | extraction: steps x batch |",
+            "| --- | --- | ---: | ---: | ---: |"]
+    return [*head, *lines.values(), ""] if lines else []
 
 
 def _again(files: Sequence[Results], folder: Path, weights: Path | None) -> dict[Path, Again | SaccadeError]:

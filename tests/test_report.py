@@ -14,13 +14,14 @@ from rich.console import Console
 from deploy.bench import bench, prepare
 from deploy.failures import CLASSES, Diagnosis, Distance, diagnose, section
 from deploy.picture import Story
-from deploy.report import report, side_by_side
+from deploy.report import report, side_by_side, training
 from deploy.report_pictures import draw_exploration, explore, pick
 from deploy.rerun import prepare_again, read_results, replay, same_as
-from shared.config import Config
+from shared.config import REPOSITORY, Config
 from shared.errors import SaccadeError
 from shared.geometry import direction, look_at, viewing_grid
 from shared.messages import Belief, Plan, Result, Truth
+from shared.weights import Weights
 from tests.fakes.weights import write_random_weights
 from tests.samples import sample
 
@@ -81,6 +82,17 @@ def test_runs_of_the_same_scenes_are_compared_one_by_one(tmp_path):
     row = next(line for line in lines if line.startswith("| last"))
     assert row.startswith("| last | belief.pose=last | 66.7 | +1, -1 |")
     assert sum(line.startswith("| ") for line in lines) == 4  # two headers, two files
+
+
+def test_training_is_told_of_the_weights_that_made_the_results(tmp_path):
+    """By the shipped manifest; a file that other weights made says nothing."""
+    weights = Weights(REPOSITORY / "weights" / "pantry")
+    config = Config().with_values({"scene.objects": "pantry"}).model_dump(mode="json")
+    own = write(tmp_path / "own.json", [record("a")], config=config, weights=weights.hashes)
+    other = write(tmp_path / "other.json", [record("a")], config=config)
+    row = training([read_results(own)])[-2]
+    assert row.startswith(f"| pantry | {weights.manifest['where_trained']} | {weights.manifest['seconds'] / 3600:.1f} |")
+    assert training([read_results(other)]) == []
 
 
 def test_files_that_are_no_results_are_said_in_one_line(tmp_path):
