@@ -91,7 +91,8 @@ def test_training_is_told_of_the_weights_that_made_the_results(tmp_path):
     own = write(tmp_path / "own.json", [record("a")], config=config, weights=weights.hashes)
     other = write(tmp_path / "other.json", [record("a")], config=config)
     row = training([read_results(own)])[-2]
-    assert row.startswith(f"| pantry | {weights.manifest['where_trained']} | {weights.manifest['seconds'] / 3600:.1f} |")
+    hours = weights.manifest["seconds"] / 3600
+    assert row.startswith(f"| pantry | {weights.manifest['where_trained']} | {hours:.1f} |")
     assert training([read_results(other)]) == []
 
 
