@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import tomllib
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -17,6 +17,9 @@ PRESETS = REPOSITORY / "deploy" / "presets"
 
 class Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+Checked = TypeVar("Checked", bound=Section)
 
 
 class BusConfig(Section):
@@ -133,12 +136,17 @@ class Config(Section):
 
 def validate(tree: dict[str, Any], where: str) -> Config:
     """The configuration in a tree. Raises SaccadeError that names the key."""
+    return checked(Config, tree, f"configuration key {{}} in {where}")
+
+
+def checked(model: type[Checked], tree: dict[str, Any], what: str) -> Checked:
+    """The section in a tree. Raises SaccadeError; in `what` the key stands for {}."""
     try:
-        return Config.model_validate(tree)
+        return model.model_validate(tree)
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
-        raise SaccadeError(f"configuration key {key!r} in {where}: {first['msg']}") from error
+        raise SaccadeError(f"{what.replace('{}', repr(key))}: {first['msg']}") from error
 
 
 def load(path: Path | None) -> Config:

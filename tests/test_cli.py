@@ -104,6 +104,8 @@ def test_topics_lists_the_registry(monkeypatch, capsys):
     (("run", "--set", "planner.stride=1"), "configuration key 'planner.stride' is unknown"),
     (("run", "--set", "planner.step_m"), "--set 'planner.step_m': write KEY=VALUE"),
     (("run", "--set", "planner.step_m=far"), "planner.step_m"),
+    (("train", "--set", "batch_cnc=3"), "training setting 'batch_cnc'"),
+    (("train", "--set", "batch_ccn=0"), "training setting 'batch_ccn'"),
     (("run", "--config", "none.toml"), "none.toml cannot be read"),
     (("run", "--names", "teapot"), "'teapot' is not in 'pantry': choose from coffee_can"),
     (("run", "--agent", "nobody"), "agent 'nobody' is unknown: choose from sceneccn, oracle"),

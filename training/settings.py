@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field, SerializerFunctionWrapHandler, ValidationError, model_serializer, model_validator
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
-from shared.config import Section
+from shared.config import Section, checked
 from shared.errors import SaccadeError
 from shared.generative_model import Architecture
 
@@ -80,12 +80,7 @@ class TrainingConfig(Section):
 
 def settings_from(values: dict[str, Any]) -> TrainingConfig:
     """The settings with these values. Raises SaccadeError that names the key."""
-    try:
-        return TrainingConfig.model_validate(values)
-    except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
-        raise SaccadeError(f"training setting {key!r}: {first['msg']}: see training/settings.py") from error
+    return checked(TrainingConfig, values, "training setting {} (see training/settings.py)")
 
 
 def load_settings(run_dir: Path) -> TrainingConfig:
