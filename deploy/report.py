@@ -16,7 +16,7 @@ from deploy import report_pictures as pictures
 from deploy.bench import SCENES_ENDING
 from deploy.failures import failed_scenes, section
 from deploy.rerun import Again, Results, prepare_again, read_results, replay, same_as
-from deploy.table import MEASURES, PAPER, PAPER_AGENTS, PAPER_ROOM, TOTAL, Estimate, Figures, Row, milliseconds, rows
+from deploy.table import MEASURES, PAPER, PAPER_AGENTS, PAPER_ROOM, Estimate, Figures, Row, milliseconds, rows
 from deploy.threads import enforce_one_thread
 from shared.config import validate
 from shared.errors import SaccadeError
@@ -76,35 +76,32 @@ def origins(files: Sequence[Results]) -> list[str]:
 
 
 def success_and_errors(files: Sequence[Results]) -> list[str]:
-    """The paper's table, each results file a group of columns."""
-    tables = {file.label: {row.name: row for row in rows(file.records)} for file in files}
-    names = [name for name in dict.fromkeys(n for t in tables.values() for n in t) if name != TOTAL] + [TOTAL]
-    paper = "paper, SceneCCN + AIF" + ("" if any(name in PAPER for name in names[:-1]) else " (YCB)")
-    groups = [paper, *(f"{f.label} (floor)" if f.agent == ORACLE else f.label for f in files)]
+    """All results and the paper's in one table, then the paper's table for each: target by target, theirs beside."""
     measures = ["success (%)", *MEASURES.values()]
     lines = ["## Success and errors", "", "Success with Wilson's 95 % interval; errors as mean ± standard error.", "",
-             "| target | " + " | ".join(f"{group}: {m}" for group in groups for m in measures) + " |",
-             "| --- |" + " ---: |" * (len(groups) * len(measures))]
-    for name in names:
-        cells = _paper_cells(PAPER.get(name))
-        for table in tables.values():
-            cells += _cells(table.get(name))
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+             "| agent, objects, scenes | " + " | ".join(measures) + " |", "| --- |" + " ---: |" * len(measures)]
+    lines += [f"| paper: {agent}, its 500 scenes | " + " | ".join(_paper_cells(figures)) + " |"
+              for agent, figures in PAPER_AGENTS.items()]
+    lines += [f"| {f.label}{' (floor)' * (f.agent == ORACLE)} | " + " | ".join(_cells(rows(f.records)[-1])) + " |"
+              for f in files]
     if files[-1].agent == ORACLE:
         lines += ["", "The oracle is told the goal's view. As an episode ends once the camera is within tolerance, "
                   "its errors are the floor for any agent."]
-    lines += ["", "The paper's agents on its 500 scenes:", "", "| agent | " + " | ".join(measures) + " |",
-              "| --- |" + " ---: |" * len(measures)]
-    lines += [f"| {agent} | " + " | ".join(_paper_cells(figures)) + " |" for agent, figures in PAPER_AGENTS.items()]
     if any(file.suite == "lexa-room" for file in files):
         room = ", ".join(f"{agent} {share}" for agent, share in PAPER_ROOM.items())
         lines += ["", f"The paper's agents in one room of five objects, success of 100 goals (%): {room}."]
+    for file in files:
+        if file.agent == ORACLE:
+            continue
+        lines += ["", f"### {file.label}", "", "| target | " + " | ".join(f"{m} | paper" for m in measures) + " |",
+                  "| --- |" + " ---: | ---: |" * len(measures)]
+        for row in rows(file.records):
+            pairs = zip(_cells(row), _paper_cells(PAPER.get(row.name) if file.objects == "ycb" else None), strict=True)
+            lines.append(f"| {row.name} | " + " | ".join(f"{ours} | {theirs}" for ours, theirs in pairs) + " |")
     return [*lines, ""]
 
 
-def _cells(row: Row | None) -> list[str]:
-    if row is None:
-        return ["-"] * (1 + len(MEASURES))
+def _cells(row: Row) -> list[str]:
     share = row.success
     return [f"{100 * share.value:.1f} ({100 * share.low:.1f} to {100 * share.high:.1f})", *map(_mean, row.means)]
 

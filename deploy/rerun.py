@@ -40,6 +40,11 @@ class Results:
         return self.facts["agent"]
 
     @property
+    def objects(self) -> str:
+        """The object set."""
+        return self.facts["objects"]
+
+    @property
     def suite(self) -> str:
         """The name of the scenes: the suite's, else the file's."""
         return self.facts["scenes"].get("suite") or self.facts["scenes"]["file"]
