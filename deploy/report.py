@@ -15,7 +15,7 @@ from rich.console import Console
 from deploy import report_pictures as pictures
 from deploy.bench import SCENES_ENDING
 from deploy.failures import failed_scenes, section
-from deploy.rerun import Again, Results, prepare_again, read_results, replay, same_as
+from deploy.rerun import Again, Results, prepare_again, read_results, replay, same_as, told_otherwise
 from deploy.table import MEASURES, PAPER, PAPER_AGENTS, PAPER_ROOM, Estimate, Figures, Row, milliseconds, rows
 from deploy.threads import enforce_one_thread
 from shared.config import validate
@@ -147,18 +147,9 @@ def side_by_side(files: Sequence[Results]) -> list[str]:
 def differences(base: Results, other: Results) -> list[str]:
     """What another run was told differently: the agent, the weights, or keys of the configuration."""
     found = [] if base.agent == other.agent else [f"agent {other.agent}"]
-    mine, theirs = (_flat({k: v for k, v in f.facts["config"].items() if k not in ("scene", "bus")})
-                    for f in (base, other))
-    found += [f"{key}={theirs[key]}" for key in theirs if key in mine and theirs[key] != mine[key]]
+    found += told_otherwise(base.facts["config"], other.facts["config"])
     changed = base.facts["weights"] != other.facts["weights"] and base.agent == other.agent
     return found + ["weights"] * (changed and not any(f.startswith("perception.weights") for f in found))
-
-
-def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    result: dict[str, Any] = {}
-    for key, value in tree.items():
-        result |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
-    return result
 
 
 def plots(files: Sequence[Results], out: Path) -> list[str]:

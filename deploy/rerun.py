@@ -62,8 +62,24 @@ def read_results(path: Path) -> Results:
     except (ValueError, KeyError, TypeError) as error:
         raise SaccadeError(f"results {path} are not of `saccade bench` ({error}): give a file that it has written"
                            ) from error
-    label = ", ".join((facts["agent"], facts["objects"], facts["scenes"].get("suite") or facts["scenes"]["file"]))
+    label = ", ".join((facts["agent"], facts["objects"], facts["scenes"].get("suite") or facts["scenes"]["file"],
+                       *told_otherwise(Config().model_dump(mode="json"), facts["config"])))
     return Results(path, facts, records, label)
+
+
+def told_otherwise(base: dict[str, Any], other: dict[str, Any]) -> list[str]:
+    """The keys in which a configuration tells the agent or its world something else than another, with their values;
+    which scenes, and over which bus, is not of these."""
+    mine, theirs = (_flat({key: value for key, value in tree.items() if key not in ("scene", "bus", "seed")})
+                    for tree in (base, other))
+    return [f"{key}={theirs[key]}" for key in theirs if key in mine and theirs[key] != mine[key]]
+
+
+def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    result: dict[str, Any] = {}
+    for key, value in tree.items():
+        result |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+    return result
 
 
 @dataclass(frozen=True)

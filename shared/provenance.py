@@ -6,12 +6,20 @@ import subprocess
 
 from shared.config import REPOSITORY
 
+WRITTEN = ("results", "docs")
+
 
 def commit() -> str:
-    """The commit of the source, with "-dirty" where it was changed since; "unknown" outside a checkout."""
-    command = ["git", "-C", str(REPOSITORY), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+    """The commit of the source, with "-dirty" where it was changed since; "unknown" outside a checkout. Results and
+    documents may change: they are what runs write."""
     try:
-        found = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
+        head = _git("rev-parse", "HEAD")
+        changed = _git("status", "--porcelain", "--untracked-files=no", "--", ".", *(f":!{room}" for room in WRITTEN))
     except (OSError, subprocess.SubprocessError):
         return "unknown"
-    return found.stdout.strip() or "unknown"
+    return head + "-dirty" * bool(changed)
+
+
+def _git(*arguments: str) -> str:
+    command = ["git", "-C", str(REPOSITORY), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=10, check=True).stdout.strip()

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import json
+import re
+import subprocess
 from collections import Counter
 from pathlib import Path
 
@@ -17,6 +19,7 @@ from deploy.registry import AGENTS, agent_pairs, agent_processes, local_pairs
 from deploy.suites import suite_file
 from deploy.table import PAPER, TOTAL, mean, milliseconds, render, rows, wilson
 from services.simulator.scenes import PAPER_SCENES, load_scenes
+from shared import provenance
 from shared.config import Config
 from shared.errors import SaccadeError
 from shared.loop import run_local
@@ -249,3 +252,22 @@ def test_missing_weights_are_said_before_anything_runs(tmp_path):
     config = Config().with_values({"perception.weights": str(Path(tmp_path) / "none")})
     with pytest.raises(SaccadeError, match=r"none/manifest\.json are missing: train them"):
         prepare("sceneccn", config, tmp_path / "o.json")
+
+
+def test_the_commit_is_dirty_by_the_source_alone(tmp_path, monkeypatch):
+    """A changed result or document says nothing about the code that ran; a changed source does."""
+    def git(*arguments):
+        subprocess.run(["git", "-C", tmp_path, "-c", "user.name=t", "-c", "user.email=t@t", *arguments], check=True,
+                       capture_output=True)
+
+    for room in ("results", "shared"):
+        (tmp_path / room).mkdir()
+        (tmp_path / room / "file").write_text("a")
+    git("init")
+    git("add", ".")
+    git("commit", "-m", "first")
+    monkeypatch.setattr(provenance, "REPOSITORY", tmp_path)
+    (tmp_path / "results" / "file").write_text("b")
+    assert re.fullmatch("[0-9a-f]{40}", provenance.commit())
+    (tmp_path / "shared" / "file").write_text("b")
+    assert provenance.commit().endswith("-dirty")
