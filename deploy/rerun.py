@@ -20,6 +20,7 @@ from shared.loop import run_local
 from shared.messages import Message
 from shared.topics import Topic
 
+TOLD_AT_MOST = 2  # settings in a label; where there are more the file's name stands for them
 FACTS = ("agent", "objects", "config", "weights", "scenes", "commit", "machine")
 
 Take = Callable[[Topic, str | None, Message], None]
@@ -62,8 +63,9 @@ def read_results(path: Path) -> Results:
     except (ValueError, KeyError, TypeError) as error:
         raise SaccadeError(f"results {path} are not of `saccade bench` ({error}): give a file that it has written"
                            ) from error
-    label = ", ".join((facts["agent"], facts["objects"], facts["scenes"].get("suite") or facts["scenes"]["file"],
-                       *told_otherwise(Config().model_dump(mode="json"), facts["config"])))
+    told = told_otherwise(Config().model_dump(mode="json"), facts["config"])
+    scenes = facts["scenes"].get("suite") or facts["scenes"]["file"]
+    label = ", ".join((facts["agent"], facts["objects"], scenes, *(told if len(told) <= TOLD_AT_MOST else [path.stem])))
     return Results(path, facts, records, label)
 
 
