@@ -113,6 +113,7 @@ PICTURES = {
     "black": lambda: grey(0), "white": lambda: grey(255), "grey": lambda: grey(120),
     "noise": lambda: np.random.default_rng(0).integers(0, 256, (480, 480, 3), np.uint8),
     "stripes": lambda: np.repeat(((np.arange(480) // 16 % 2) * 255).astype(np.uint8), 480 * 3).reshape(480, 480, 3),
+    "bands": lambda: np.random.default_rng(0).integers(0, 256, (24, 1, 3), np.uint8).repeat(20, 0).repeat(480, 1),
     "unknown can": lambda: unknown("soup_can"), "unknown box": lambda: unknown("cereal_box"),
 }
 
@@ -120,8 +121,8 @@ PICTURES = {
 @pytest.mark.parametrize("image", PICTURES)
 def test_a_goal_image_of_nothing_known_gives_low_confidence_and_no_arrival(agent, world, scenes, image):
     """What the image shows is no known object: the agent says so by its confidence, explores, and does not crash."""
-    told = play(agent, world, scenes[0], max_steps=12, goal_rgb=np.ascontiguousarray(PICTURES[image]()))
-    assert last(told, "plan").goal_confidence < CONFIG.planner.goal_confidence
+    told = play(agent, world, scenes[0], max_steps=12, goal_rgb=PICTURES[image]())
+    assert last(told, "plan").goal_confidence < 0.2
     assert last(told, "plan").target == ""
     assert not last(told, "result").declared
 

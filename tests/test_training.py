@@ -73,13 +73,12 @@ def test_the_crops_say_where_the_object_is(finished):
 def test_clean_crops_are_the_views_themselves(finished):
     """With crops "clean" what the CCN sees is what it shall draw, and all of it lies within its mask."""
     views = [load_views(finished, name) for name in NAMES]
-    task = CcnTask(TINY.model_copy(update={"crops": "clean"}), views, NAMES[0], torch.device("cpu"))
-    batch = task.composer.undisturbed(torch.arange(5))
+    clean, disturbed = (CcnTask(TINY.model_copy(update={"crops": crops}), views, NAMES[0], torch.device("cpu"))
+                        for crops in ("clean", "as_detected"))
+    batch = clean.composer.undisturbed(torch.arange(5))
     assert torch.equal(batch.rgb, batch.target)
     assert float((batch.rgb.sum(1) * (batch.mask[:, 0] == 0)).sum()) < 0.01 * float(batch.rgb.sum())
     assert 0.1 < float(batch.mask.mean()) < 0.7
-    clean, disturbed = (CcnTask(TINY.model_copy(update={"crops": crops}), views, NAMES[0], torch.device("cpu"))
-                        for crops in ("clean", "as_detected"))
     assert clean.loss(0)[1]["first"] != disturbed.loss(0)[1]["first"]
 
 

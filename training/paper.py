@@ -100,7 +100,11 @@ class PaperExtractionTask:
 def loss_l2(network: PaperExtraction, ccn: CCN, batch: FrameBatch, clean: Tensor,
             expected: tuple[Tensor, Tensor] | None, config: TrainingConfig) -> tuple[Tensor, dict[str, float]]:
     """The masking, cropping and identification errors, and the KL terms of the latent that the crop gives: against the
-    one `expected` after a displacement, and against a standard normal. What is not seen has neither crop nor latent."""
+    one `expected` after a displacement, and against a standard normal. What is not seen has neither crop nor latent.
+
+    `expected` is None where the KL terms weigh nothing. With `config.guide_extraction` the error of centre and log
+    scale counts too, which is not in the paper.
+    """
     mask, center, scale, crop, logit = network(batch.image.contiguous(memory_format=torch.channels_last))
     visible = batch.visible[:, 0]
     seen = (visible > SEEN).float()
