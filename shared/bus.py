@@ -5,7 +5,9 @@ Every endpoint is named: nothing is scouted, and nothing listens beyond the addr
 
 from __future__ import annotations
 
+import contextlib
 import json
+import queue
 import re
 import socket
 import threading
@@ -13,20 +15,32 @@ from collections.abc import Callable, Iterable
 from typing import Protocol
 
 from shared.errors import SaccadeError
-from shared.messages import MAX_BYTES
+from shared.messages import MAX_BYTES, MessageError, decode
+from shared.outbox import PAGE_BYTES, Kept, Since
 from shared.topics import ROOT, Topic, parse_key
 
 Deliver = Callable[[Topic, str | None, bytes], None]  # runs on the bus's thread: must only put its arguments somewhere
+Answer = Callable[[Iterable[Topic], Since | None, int], list[Kept]]
+
+RECALL_S = 5.0  # for an answer to be whole: a publisher that hangs must not hang who asks it
 
 
 class Bus(Protocol):
-    """Messages of one key arrive in the order in which they were published; nothing is dropped."""
+    """Messages of one key arrive in the order in which they were published. What was lost on the way, while a process
+    or the router was away, its publisher still knows: `recall`."""
 
     def publish(self, topic: Topic, part: str | None, payload: bytes) -> None:
         """Sends wire bytes to whoever subscribes."""
 
     def subscribe(self, topics: Iterable[Topic] | None, deliver: Deliver) -> None:
         """Calls `deliver(topic, part, payload)` for every message of these topics, or of all."""
+
+    def answer(self, topics: Iterable[Topic], answer: Answer) -> None:
+        """Lets `answer(topics, since, limit_bytes)` tell others what was published on these topics."""
+
+    def recall(self, topics: Iterable[Topic], since: Since | None = None, limit_bytes: int = PAGE_BYTES) -> list[Kept]:
+        """What the publishers of these topics keep from (run, episode, step) on, or of their newest episode: each
+        one's messages in their order, at most about `limit_bytes` of each. Empty where nobody answers."""
 
     def close(self) -> None:
         """Leaves the bus. May be called twice."""
@@ -37,6 +51,7 @@ class LocalBus:
 
     def __init__(self) -> None:
         self._subscribers: list[tuple[frozenset[str] | None, Deliver]] = []
+        self._answers: list[tuple[frozenset[str], Answer]] = []
 
     def publish(self, topic: Topic, part: str | None, payload: bytes) -> None:
         """Delivers at once, on the caller's thread."""
@@ -48,9 +63,20 @@ class LocalBus:
         """From now on; nothing published before is repeated."""
         self._subscribers.append((None if topics is None else frozenset(t.name for t in topics), deliver))
 
+    def answer(self, topics: Iterable[Topic], answer: Answer) -> None:
+        """From now on."""
+        self._answers.append((frozenset(t.name for t in topics), answer))
+
+    def recall(self, topics: Iterable[Topic], since: Since | None = None, limit_bytes: int = PAGE_BYTES) -> list[Kept]:
+        """Asks at once, on the caller's thread."""
+        topics = tuple(topics)
+        return [kept for names, answer in list(self._answers)
+                if (asked := [t for t in topics if t.name in names]) for kept in answer(asked, since, limit_bytes)]
+
     def close(self) -> None:
         """Forgets the subscribers."""
         self._subscribers.clear()
+        self._answers.clear()
 
 
 class ZenohBus:
@@ -68,6 +94,8 @@ class ZenohBus:
         self._lock = threading.Lock()
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._subscribers: list[zenoh.Subscriber] = []
+        self._queryables: list[zenoh.Queryable] = []
+        self._questions: queue.SimpleQueue = queue.SimpleQueue()
         self._closed = False
         self.endpoint = endpoint
         if not listen and endpoint.endswith(":0"):
@@ -105,13 +133,53 @@ class ZenohBus:
 
         self._subscribers += [self._session.declare_subscriber(key, receive) for key in keys]
 
+    def answer(self, topics: Iterable[Topic], answer: Answer) -> None:
+        """Answers on a thread of its own: Zenoh's must not wait."""
+        for topic in topics:
+            self._queryables.append(self._session.declare_queryable(
+                topic.key(self._world), lambda query, topic=topic: self._questions.put((topic, query))))
+        threading.Thread(target=self._answer_all, args=(answer,), name="answers", daemon=True).start()
+
+    def _answer_all(self, answer: Answer) -> None:
+        while (asked := self._questions.get()) is not None:
+            topic, query = asked
+            with contextlib.suppress(self._zenoh.ZError, ValueError, TypeError, KeyError):  # who asks is gone, or mad
+                question = json.loads(query.payload.to_bytes()) if query.payload else {"since": None, "limit": 0}
+                since = question["since"] and (str(question["since"][0]), *map(int, question["since"][1:3]))
+                for kept in answer((topic,), since, int(question["limit"])):
+                    query.reply(topic.key(self._world, kept.part), kept.payload,
+                                attachment=str(kept.published_ns).encode())
+            del asked, query  # a query ends when it is forgotten
+
+    def recall(self, topics: Iterable[Topic], since: Since | None = None, limit_bytes: int = PAGE_BYTES) -> list[Kept]:
+        """Asks one topic after the other; what is no valid message is left out."""
+        question = json.dumps({"since": since, "limit": limit_bytes})
+        return [kept for topic in topics for kept in self._recall(topic, question)]
+
+    def _recall(self, topic: Topic, question: str) -> Iterable[Kept]:
+        try:
+            replies = self._session.get(topic.key(self._world), payload=question, timeout=RECALL_S,
+                                        target=self._zenoh.QueryTarget.ALL,
+                                        consolidation=self._zenoh.ConsolidationMode.NONE)
+            for sample in (reply.ok for reply in replies):
+                with contextlib.suppress(SaccadeError, MessageError, ValueError):
+                    if sample is not None and sample.attachment is not None:
+                        _, _, part = parse_key(str(sample.key_expr))
+                        payload = sample.payload.to_bytes()
+                        message = decode(topic.type, payload)
+                        yield Kept(topic, part, payload, (message.run, message.episode, message.step),
+                                   int(sample.attachment.to_bytes()))
+        except self._zenoh.ZError:
+            return  # no router at present
+
     def close(self) -> None:
         """Undeclares before it closes: a callback left behind can keep a process from ending."""
         with self._lock:
             if self._closed:
                 return
             self._closed = True
-        for entity in (*self._subscribers, *self._publishers.values()):
+        self._questions.put(None)
+        for entity in (*self._subscribers, *self._queryables, *self._publishers.values()):
             entity.undeclare()
         self._session.close()
 

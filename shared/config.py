@@ -29,6 +29,8 @@ class BusConfig(Section):
     endpoint: str = "tcp/127.0.0.1:0"  # port 0: the launcher picks a free one
     world: str = Field("table", pattern=r"^[A-Za-z0-9_-]{1,64}$")
     wait_for: tuple[str, ...] = ()  # services that must be ready before the source begins; the launcher fills it in
+    live: bool = False  # nobody waits: each service takes the newest step and says what it skipped
+    first_step: int = Field(0, ge=0)  # of an episode in lockstep: a log that was cut begins later
 
 
 class SceneConfig(Section):

@@ -11,6 +11,7 @@ from shared.bus import Bus, ZenohBus
 from shared.config import Config
 from shared.errors import SaccadeError
 from shared.messages import Message, MessageError, decode, encode
+from shared.outbox import Outbox
 from shared.process import DRAIN_S, Health, Heartbeat, Inbox, run_process
 from shared.service import Core, Output, Service
 from shared.stepper import GapCounter, Stepper, settle
@@ -19,7 +20,7 @@ from shared.topics import STATUS, Topic
 OnMessage = Callable[[Topic, str | None, Message, bytes | None], None]
 OnStep = Callable[[str, float], None]
 READY_STATES = ("ready", "busy")
-IDLE_S = 2.0  # after so long a service says what it waits for
+IDLE_S = 1.0  # after so long without a message a service asks for what it lacks, and says so
 WAITS = "waits for "
 
 
@@ -36,7 +37,8 @@ def main(service: Service, build: Callable[[Config], Core], *, source: bool = Fa
         core = build(config)
         bus = ZenohBus(config.bus.endpoint, world=config.bus.world)
         try:
-            serve(service, core, bus, names, run=folder.name, source=source, wait_for=config.bus.wait_for, inbox=inbox)
+            serve(service, core, bus, names, run=folder.name, source=source, wait_for=config.bus.wait_for, inbox=inbox,
+                  live=config.bus.live, first_step=config.bus.first_step)
         finally:
             bus.close()
 
@@ -44,62 +46,96 @@ def main(service: Service, build: Callable[[Config], Core], *, source: bool = Fa
 
 
 def serve(service: Service, core: Core, bus: Bus, parts: tuple[str, ...], *, run: str, source: bool = False,
-          wait_for: tuple[str, ...] = (), inbox: Inbox | None = None) -> Health:
-    """Runs a core on a bus until `inbox` is stopped; returns what it counted."""
+          wait_for: tuple[str, ...] = (), inbox: Inbox | None = None, live: bool = False,
+          first_step: int = 0) -> Health:
+    """Runs a core on a bus until `inbox` is stopped; returns what it counted.
+
+    What was published before this service was there, or while it or the router was away, is asked for: at the start,
+    and whenever nothing comes. So a service that is started again folds the episode so far and goes on.
+    """
     inbox = inbox or Inbox()
-    loop = _Loop(service, core, bus, parts, run, source, wait_for)
-    bus.subscribe(service.inputs + ((STATUS,) if loop.awaited else ()), inbox.put)
+    stepper = Stepper(service, core, parts, source=source, live=live, first_step=first_step)
+    loop = _Loop(stepper, bus, run, wait_for if source else ())
+    bus.answer(service.outputs, loop.outbox.answer)
+    bus.subscribe(loop.topics + ((STATUS,) if loop.awaited else ()), inbox.put)
     with Heartbeat(bus, loop.health, inbox.stop):
         loop.health.say("ready", WAITS + ", ".join(sorted(loop.awaited)) if loop.awaited else "")
         loop.begin_if_due()
+        loop.catch_up()
         for item in inbox.items(0.0 if source else DRAIN_S, tick_s=IDLE_S):
             if item is None:
+                loop.catch_up()
                 loop.say_what_lacks()
             else:
-                loop.handle(*item)
+                loop.handle(*item, more=live and inbox.waiting)
     return loop.health
 
 
 class _Loop:
     """What one service does with one message."""
 
-    def __init__(self, service: Service, core: Core, bus: Bus, parts: tuple[str, ...], run: str, source: bool,
-                 wait_for: tuple[str, ...]) -> None:
-        self.health = Health(service.name)
-        self.awaited = set(wait_for) if source else set()
-        self._stepper = Stepper(service, core, parts, source=source)
+    def __init__(self, stepper: Stepper, bus: Bus, run: str, wait_for: tuple[str, ...]) -> None:
+        service = stepper.service
+        self.health, self.outbox, self.awaited = Health(service.name), Outbox(), set(wait_for)
+        self.topics = service.inputs + ((service.closed_by,) if service.closed_by else ())
+        self._source = stepper.episode_done  # between episodes from the start
+        self._stepper, self._bus, self._run, self._service = stepper, bus, run, service
         self._gaps = GapCounter()
-        self._bus, self._run, self._source = bus, run, source
-        self._episode = 0
+        self._next_episode, self._closed = 0, -1
 
-    def handle(self, topic: Topic, part: str | None, payload: bytes) -> None:
+    def handle(self, topic: Topic, part: str | None, payload: bytes, *, more: bool = False) -> None:
+        """Takes a message; runs the core for every step that it completes, unless there are `more` to look at first."""
         if topic == STATUS:
             self._note_status(part, payload)
             return
         self.health.received += 1
         try:
             message = decode(topic.type, payload)
-            self.health.gaps += self._gaps.lost(topic, part, message)
+            self.health.gaps += self._gaps.lost(topic, part, message) or 0
+            if topic == self._service.closed_by:
+                self._close(message)
+                return
             self._stepper.offer(topic, part, message)
         except MessageError as error:
             self.health.refuse(topic, part, error)
             return
-        while self._step(topic, part, self._stepper.advance):
+        while not more and self._step(topic, part, self._stepper.advance):
             self.begin_if_due()
 
     def begin_if_due(self) -> None:
-        """Begins a source's next episode, if none is under way and everyone is there."""
-        while self._source and not self.awaited and self._stepper.episode_done:
-            if self._episode >= self._stepper.core.episodes:
+        """Begins a source's next episode, if everyone is there and the one before it is over and closed."""
+        while self._source and not self.awaited and self._stepper.episode_done and self._is_closed:
+            if self._next_episode >= self._stepper.core.episodes:
                 self.health.say("finished")
                 return
-            episode, self._episode = self._episode, self._episode + 1
+            episode, self._next_episode = self._next_episode, self._next_episode + 1
             self._step(None, None, lambda e=episode: self._stepper.begin(self._run, e))
+
+    def catch_up(self) -> None:
+        """Asks for inputs that were published and have not come, until there are none that lead on."""
+        latched = [topic for topic in self.topics if topic.latched and topic != self._service.closed_by]
+        others = [topic for topic in self.topics if topic not in latched]
+        while not self.awaited:
+            wants = self._stepper.wants
+            kept = self._bus.recall(latched, wants and (*wants[:2], 0)) + self._bus.recall(others, wants)
+            for topic, part, payload, *_ in kept:
+                self.handle(topic, part, payload)
+            if self._stepper.wants == wants:
+                return
 
     def say_what_lacks(self) -> None:
         """Nothing has come for a while: puts the inputs that the next step still needs into the status."""
         if lacks := self._stepper.waits_for():
             self.health.say(note=WAITS + ", ".join(lacks))
+
+    @property
+    def _is_closed(self) -> bool:
+        return self._service.closed_by is None or self._closed >= self._next_episode - 1
+
+    def _close(self, message: Message) -> None:
+        if message.run == self._run:
+            self._closed = max(self._closed, message.episode)
+            self.begin_if_due()
 
     def _note_status(self, part: str | None, payload: bytes) -> None:
         try:
@@ -108,9 +144,13 @@ class _Loop:
             return  # whoever sent it is not ready
         if part in self.awaited and status.state in READY_STATES:
             self.awaited.discard(part)
+            if status.run == self._run:  # this source was here before: the others are in that episode already
+                self._next_episode = max(self._next_episode, status.episode)
+                self._closed = self._next_episode - 1
             if not self.awaited:
                 self.health.say(note="")
                 self.begin_if_due()
+                self.catch_up()
 
     def _step(self, topic: Topic | None, part: str | None, make: Callable[[], list[Output] | None]) -> bool:
         """Runs the core once and publishes what it made; whether there was anything to do."""
@@ -127,7 +167,7 @@ class _Loop:
         except MessageError as error:
             if topic is None:
                 name = self.health.service
-                raise SaccadeError(f"{name} cannot begin episode {self._episode - 1}: {error}") from error
+                raise SaccadeError(f"{name} cannot begin episode {self._next_episode - 1}: {error}") from error
             self.health.refuse(topic, part, error)
         finally:
             self.health.state = before
@@ -143,6 +183,7 @@ class _Loop:
             except MessageError as error:
                 raise MessageError(f"gives an invalid {output.topic.name}: {error}") from error
         for output, payload in zip(outputs, encoded, strict=True):
+            self.outbox.keep(output.topic, output.part, output.message, payload)
             self._bus.publish(output.topic, output.part, payload)
             self.health.published += 1
 

@@ -63,6 +63,11 @@ class Inbox:
             return item
         return None
 
+    @property
+    def waiting(self) -> bool:
+        """Whether something is there to be taken."""
+        return not self._queue.empty()
+
     def items(self, drain_s: float = DRAIN_S, tick_s: float | None = None) -> Iterator[Item | None]:
         """Every item up to `stop`, then what follows without a pause, for `drain_s` seconds at most. With `tick_s`
         also None whenever nothing came for so long."""

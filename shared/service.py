@@ -13,12 +13,14 @@ from shared.topics import Topic
 @dataclass(frozen=True)
 class Service:
     """A declaration. The core runs once per step of `trigger`, when all `inputs` of that step (and the latched ones of
-    the episode) are there. A service without a trigger is driven by its own `begin` (the simulator, a camera)."""
+    the episode) are there. A source (the simulator, a camera) begins episodes by itself; `closed_by` is the topic that
+    must have answered an episode that is done before the next one begins."""
 
     name: str
     inputs: tuple[Topic, ...]
     trigger: Topic
     outputs: tuple[Topic, ...]
+    closed_by: Topic | None = None
 
 
 @dataclass(frozen=True)

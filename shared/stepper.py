@@ -23,7 +23,7 @@ Slot = dict[str, dict[str | None, Message]]  # topic name -> part -> message
 
 
 class Stamper:
-    """Numbers messages per key, in the order in which they are made."""
+    """Numbers the messages of an episode per key, in the order in which they are made."""
 
     def __init__(self) -> None:
         self._next: dict[tuple[str, str | None], int] = {}
@@ -37,38 +37,50 @@ class Stamper:
 
 
 class GapCounter:
-    """Tells from sequence numbers how many messages of a key were lost. A lower number is a publisher started anew."""
+    """Tells from sequence numbers how many messages of a key were lost.
+
+    They count from 0 in every episode, so that a service that was started again gives the same ones. A status counts
+    from 0 in every process.
+    """
 
     def __init__(self, *, from_start: bool = False) -> None:
         self._from_start = from_start  # whether the counter has listened since before the first message
-        self._last: dict[tuple[str, str | None], tuple[str, int]] = {}
+        self._last: dict[tuple[str, str | None], tuple[str, int, int]] = {}  # run, episode, seq
 
-    def lost(self, topic: Topic, part: str | None, message: Message) -> int:
-        """How many messages of this key are missing just before this one."""
-        key = (topic.name, part)
+    def lost(self, topic: Topic, part: str | None, message: Message) -> int | None:
+        """How many messages of this key are missing just before this one; None for one that was there already."""
+        key, now = (topic.name, part), (message.run, message.episode, message.seq)
         known = self._last.get(key)
-        self._last[key] = (message.run, message.seq)
-        if known is None or known[0] != message.run:
-            return message.seq if self._from_start and topic.in_step else 0
-        return max(0, message.seq - known[1] - 1)
+        if not topic.in_step:
+            self._last[key] = now
+            return max(0, now[2] - known[2] - 1) if known else 0
+        if known is not None and known[0] == now[0] and now[1:] <= known[1:]:
+            return None
+        self._last[key] = now
+        if known is not None and known[:2] == now[:2]:
+            return now[2] - known[2] - 1
+        return now[2] if self._from_start or known is not None else 0
 
 
 class Stepper:
     """One core between its inputs and its outputs.
 
-    `offer` files a message, `advance` runs the core if a step is complete. Steps run in order; a latched message of
-    step s holds from step s of its episode. `parts` are the names of the run's objects. For a source, `begin` starts
-    an episode, and the inputs must answer the step it published last.
+    `offer` files a message, `advance` runs the core if a step is complete. In lockstep each step of an episode is
+    taken, from the first (`first_step`; a log that was cut begins later): a core's state is a fold over all of them,
+    and what is lacking can be asked for (`wants`). `live`, the newest complete step is taken and those before it are
+    skipped. A latched message of step s holds from step s of its episode. `parts` are the names of the run's objects.
+    For a source, `begin` starts an episode, and the inputs must answer the step it published last.
     """
 
-    def __init__(self, service: Service, core: Core, parts: tuple[str, ...], *, source: bool = False) -> None:
+    def __init__(self, service: Service, core: Core, parts: tuple[str, ...], *, source: bool = False,
+                 live: bool = False, first_step: int = 0) -> None:
         if service.trigger not in service.inputs:
             raise SaccadeError(f"service {service.name}: its trigger {service.trigger.name} is not among its inputs")
         self.service, self.core, self.parts = service, core, parts
         self.skipped = 0  # steps that never became complete
         self.episode_done = source  # a source is between episodes
         self.at: tuple[str, int, int] = ("", 0, 0)  # run, episode, step last begun or stepped
-        self._source = source
+        self._source, self._live, self._first_step = source, live, first_step
         self._begun: Episode | None = None
         self._past_runs: set[str] = set()
         self._last_step = -1  # of the current episode
@@ -94,9 +106,9 @@ class Stepper:
         if self._source and message.step != self._last_step:
             raise MessageError(f"step: {message.step}, not {self._last_step}")
         slot = self._slots.setdefault((message.run, message.episode, message.step), {})
-        if part in slot.setdefault(topic.name, {}):
-            raise MessageError(f"step: a second message for step {message.step}")
-        slot[topic.name][part] = message
+        known = slot.setdefault(topic.name, {}).setdefault(part, message)
+        if known is not message and not _same(known, message):
+            raise MessageError(f"step: a second, other message for step {message.step}")
         self._limit()
 
     def begin(self, run: str, episode: int) -> list[Output]:
@@ -116,11 +128,21 @@ class Stepper:
             self._forget(at)
             return first + self._emit(self.core.step(inputs))
 
+    @property
+    def wants(self) -> tuple[str, int, int] | None:
+        """Run, episode and step from which on inputs are needed; None before the first episode."""
+        if self._begun is None:
+            return None
+        return (*self._begun, max(0, self._last_step if self._source else self._last_step + 1))
+
     def waits_for(self) -> list[str]:
-        """What the oldest incomplete step lacks, as texts such as 'percept/mug of step 3'; empty if nothing is open."""
+        """What the next step lacks, as texts such as 'percept/mug of step 3'; empty if nothing is open."""
         if not self._slots:
             return []
         at = min(self._slots, key=lambda a: a[1:])
+        if not self._live and not self._source:
+            due = self._last_step + 1 if self._begun == at[:2] else self._first_step
+            at = (*at[:2], min(at[2], due))
         return [f"{name if part is None else f'{name}/{part}'} of step {at[2]} of episode {at[1]}"
                 for name, part in self._lacks(at)]
 
@@ -131,7 +153,9 @@ class Stepper:
             return self._source
         if message.episode != self._begun[1]:
             return message.episode < self._begun[1]
-        return self.episode_done or (not topic.latched and message.step <= self._last_step and not self._source)
+        if self._source:
+            return self.episode_done or message.step < self._last_step
+        return not topic.latched and message.step <= self._last_step
 
     def _latch(self, topic: Topic, part: str | None, message: Message) -> None:
         known = self._latched.setdefault((message.run, message.episode), {}).setdefault(topic.name, {})
@@ -146,7 +170,7 @@ class Stepper:
             self.skipped += 1
 
     def _lacks(self, at: tuple[str, int, int]) -> list[tuple[str, str | None]]:
-        slot, latched = self._slots[at], self._latched.get(at[:2], {})
+        slot, latched = self._slots.get(at, {}), self._latched.get(at[:2], {})
         lacking = []
         for topic in self.service.inputs:
             for part in self.parts if topic.parts else (None,):
@@ -159,11 +183,17 @@ class Stepper:
         return lacking
 
     def _next_complete(self) -> tuple[str, int, int] | None:
-        complete = [at for at in self._slots if not self._lacks(at)]
+        complete = [at for at in self._slots if self._is_due(at) and not self._lacks(at)]
         if not complete:
             return None
         run = complete[0][0]  # runs follow one another in order of arrival, their steps by number
-        return min(at for at in complete if at[0] == run)
+        return (max if self._live else min)(at for at in complete if at[0] == run)
+
+    def _is_due(self, at: tuple[str, int, int]) -> bool:
+        """Whether this step may be the next one."""
+        if self._live or self._source:
+            return True
+        return at[2] == (self._last_step + 1 if self._begun == at[:2] else self._first_step)
 
     def _inputs(self, at: tuple[str, int, int]) -> dict[str, Any]:
         slot, latched = self._slots[at], self._latched.get(at[:2], {})
@@ -180,7 +210,7 @@ class Stepper:
         if self._begun is not None and self._begun[0] != episode[0]:
             self._past_runs.add(self._begun[0])
         self._begun, self._last_step, self.at = episode, -1, (*episode, 0)
-        self.episode_done = False
+        self.episode_done, self._stamper = False, Stamper()
         self._latched = {e: v for e, v in self._latched.items() if e[0] != episode[0] or e[1] >= episode[1]}
         return self.core.begin(*episode)
 
@@ -202,6 +232,11 @@ class Stepper:
                 self.at = (output.message.run, output.message.episode, self._last_step)
                 self.episode_done |= output.topic == TRUTH and output.message.done
         return stamped
+
+
+def _same(one: Message, other: Message) -> bool:
+    return all(np.array_equal(getattr(one, field.name), getattr(other, field.name))
+               for field in dataclasses.fields(one))
 
 
 def settle(message: Message) -> Message:

@@ -7,7 +7,6 @@ import queue
 import threading
 from collections import defaultdict
 from contextlib import closing
-from dataclasses import replace
 
 import msgpack
 import numpy as np
@@ -111,11 +110,11 @@ def test_passing_messages_unencoded_changes_no_byte():
 
 
 def test_chosen_episodes_are_those_of_the_whole_run():
-    """Only the sequence numbers tell; every step of a core is timed under its service's name."""
+    """To the byte; every step of a core is timed under its service's name."""
 
     def messages(episodes, seen, steps):
         run_local(pairs(CONFIG), PARTS, "r", episodes,
-                  lambda t, p, m, _: seen.append((t, p, encode(replace(m, seq=0)))),
+                  lambda t, p, m, _: seen.append((t, p, encode(m))),
                   on_step=lambda service, milliseconds: steps.append((service, milliseconds >= 0)))
         return by_key(e for e in seen if decode(e[0].type, e[2]).episode == 1)
 
@@ -126,9 +125,13 @@ def test_chosen_episodes_are_those_of_the_whole_run():
     assert steps.count(("planner", True)) == CONFIG.simulator.max_steps
 
 
-def test_sequence_numbers_count_the_messages_of_each_key():
+def test_sequence_numbers_count_the_messages_of_each_key_in_every_episode():
     for (name, _), payloads in locally(encoded=True).items():
-        assert [decode(TOPICS[name].type, p).seq for p in payloads] == list(range(len(payloads)))
+        episodes = defaultdict(list)
+        for message in (decode(TOPICS[name].type, payload) for payload in payloads):
+            episodes[message.episode].append(message.seq)
+        assert len(episodes) == CONFIG.scene.count
+        assert all(seqs == list(range(len(seqs))) for seqs in episodes.values())
 
 
 def nonsense(topic) -> dict[str, bytes]:
@@ -198,9 +201,9 @@ def test_a_service_says_what_it_waits_for_and_goes_on_when_it_comes(monkeypatch)
     monkeypatch.setattr("shared.loop.IDLE_S", 0.05)
     with closing(Running("local", names=("planner",))) as running:
         running.until_status("planner", lambda s: s.state == "ready")
-        running.listener.publish(BELIEF, "can", encode(sample(BELIEF.type, object="can", step=2)))
-        running.until_status("planner", lambda s: s.note == "waits for belief/mug of step 2 of episode 3")
-        running.listener.publish(BELIEF, "mug", encode(sample(BELIEF.type, object="mug", step=2)))
+        running.listener.publish(BELIEF, "can", encode(sample(BELIEF.type, object="can", step=0)))
+        running.until_status("planner", lambda s: s.note == "waits for belief/mug of step 0 of episode 3")
+        running.listener.publish(BELIEF, "mug", encode(sample(BELIEF.type, object="mug", step=0)))
         running.until(lambda t, p, b: t == ACTION)
         running.until_status("planner", lambda s: s.note == "")
 
@@ -236,7 +239,7 @@ def test_a_core_that_gives_an_invalid_message_publishes_nothing_of_that_step():
     thread.start()
     while decode(Status, seen.get(timeout=WAIT_S)[2]).state != "ready":
         pass
-    bus.publish(TRUTH, None, encode(sample(TRUTH.type)))
+    bus.publish(TRUTH, None, encode(sample(TRUTH.type, step=0)))
     while (status := decode(Status, seen.get(timeout=WAIT_S)[2])).refused == 0:
         pass
     inbox.stop()

@@ -10,7 +10,7 @@ import pytest
 from shared.messages import MessageError, encode
 from shared.service import Service
 from shared.stepper import GapCounter, Stepper, settle
-from shared.topics import ACTION, FRAME, GOAL, PERCEPT, PLAN, TRUTH
+from shared.topics import ACTION, FRAME, GOAL, PERCEPT, PLAN, STATUS, TRUTH
 from tests.fakes.services import SIMULATOR, FakeSimulator
 from tests.samples import sample
 
@@ -76,8 +76,32 @@ def test_a_new_episode_begins_with_its_first_complete_step():
     assert stepper.skipped == 0
 
 
-def test_an_incomplete_step_is_skipped_once_a_later_one_is_complete():
+def test_in_lockstep_no_step_is_left_out_and_what_lacks_is_known():
+    """A core's state is a fold: a later step waits, however complete, until those before it have come."""
     stepper = Stepper(BOTH, core := Keeper(), ("mug",))
+    assert stepper.wants is None
+    offer(stepper, GOAL)
+    for step in (2, 0, 1):
+        assert not offer(stepper, TRUTH, step=step)
+    assert not offer(stepper, PERCEPT, "mug", step=2)
+    assert stepper.waits_for() == ["percept/mug of step 0 of episode 0"]
+    assert offer(stepper, PERCEPT, "mug", step=0)
+    assert stepper.wants == ("r", 0, 1)
+    assert offer(stepper, PERCEPT, "mug", step=1)
+    assert stepper.advance() is not None
+    assert [inputs["truth"].step for inputs in core.steps] == [0, 1, 2]
+    assert stepper.skipped == 0
+
+
+def test_a_log_that_was_cut_begins_with_its_own_first_step():
+    stepper = Stepper(Service("s", inputs=(TRUTH,), trigger=TRUTH, outputs=()), Keeper(), PARTS, first_step=3)
+    assert not offer(stepper, TRUTH, step=4)
+    assert offer(stepper, TRUTH, step=3)
+    assert stepper.advance() is not None
+
+
+def test_live_the_newest_complete_step_is_taken_and_those_before_are_skipped():
+    stepper = Stepper(BOTH, core := Keeper(), ("mug",), live=True)
     offer(stepper, GOAL)
     offer(stepper, TRUTH, step=0)
     offer(stepper, TRUTH, step=1)
@@ -90,14 +114,17 @@ def test_an_incomplete_step_is_skipped_once_a_later_one_is_complete():
 def test_a_second_message_of_a_step_and_a_wrong_step_for_a_source_are_refused():
     stepper = Stepper(BOTH, Keeper(), PARTS)
     offer(stepper, TRUTH)
-    with pytest.raises(MessageError, match="second"):
-        offer(stepper, TRUTH)
+    offer(stepper, TRUTH)  # said once more, by a service that was started again
+    with pytest.raises(MessageError, match="second, other"):
+        offer(stepper, TRUTH, scene="another")
     with pytest.raises(MessageError, match="not an input"):
         offer(stepper, PLAN)
     simulator = Stepper(SIMULATOR, FakeSimulator(0, 1, 9), PARTS, source=True)
     simulator.begin("r", 0)
     with pytest.raises(MessageError, match="step: 3, not 0"):
         offer(simulator, ACTION, step=3)
+    assert offer(simulator, ACTION, step=0)
+    assert not offer(simulator, ACTION, step=0)
 
 
 def test_stray_steps_do_not_pile_up():
@@ -112,9 +139,17 @@ def test_stray_steps_do_not_pile_up():
 def test_gaps_are_counted_per_key():
     counter = GapCounter()
     lost = [counter.lost(PERCEPT, part, sample(PERCEPT.type, run="r", seq=seq))
-            for part, seq in (("mug", 4), ("can", 0), ("mug", 5), ("can", 3), ("mug", 9), ("mug", 0), ("mug", 1))]
-    assert lost == [0, 0, 0, 2, 3, 0, 0]
+            for part, seq in (("mug", 4), ("can", 0), ("mug", 5), ("can", 3), ("mug", 9), ("mug", 0), ("mug", 9))]
+    assert lost == [0, 0, 0, 2, 3, None, None]
+    later = [counter.lost(PERCEPT, "mug", sample(PERCEPT.type, run="r", episode=e, seq=s))
+             for e, s in ((4, 2), (3, 11), (4, 3))]
+    assert later == [2, None, 0]
     assert GapCounter(from_start=True).lost(PERCEPT, "mug", sample(PERCEPT.type, seq=4)) == 4
+
+
+def test_a_status_counts_anew_in_a_process_that_was_started_again():
+    counter = GapCounter()
+    assert [counter.lost(STATUS, "belief", sample(STATUS.type, seq=seq)) for seq in (7, 8, 0, 1, 3)] == [0, 0, 0, 0, 1]
 
 
 def test_settled_arrays_are_aligned_frozen_and_no_ones_else():

@@ -20,9 +20,10 @@ from shared.messages import Frame, Goal, Truth
 from shared.seeding import generator
 from shared.service import Inputs, Output, Service
 from shared.task import MAX_STEPS, Episode, spheres_around
-from shared.topics import ACTION, FRAME, GOAL, TRUTH
+from shared.topics import ACTION, FRAME, GOAL, RESULT, TRUTH
 
-SERVICE = Service("simulator", inputs=(ACTION,), trigger=ACTION, outputs=(FRAME, GOAL, TRUTH))
+SERVICE = Service("simulator", inputs=(ACTION,), trigger=ACTION, outputs=(FRAME, GOAL, TRUTH),
+                  closed_by=RESULT)
 
 
 class Simulator:
