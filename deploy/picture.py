@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from services.simulator.world import TABLE_SIDE_M
 from shared.errors import SaccadeError
 from shared.messages import Belief, Message, Plan, Result, Truth
-from shared.recording import RunReader
+from shared.reading import RunReader
 from shared.topics import BELIEF, FRAME, GOAL, PLAN, RESULT, TRUTH, Topic
 
 COLOURS = ("#d1495b", "#00798c", "#edae49", "#7b2d8b", "#3a7d44", "#2e4057", "#f26419", "#66a182")

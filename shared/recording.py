@@ -1,36 +1,28 @@
-"""The log of a run as MCAP: the wire bytes as they were. A crash loses little of it, and the reader says so."""
+"""Writing the log of a run as MCAP: the wire bytes as they were. A crash loses little of it."""
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
-import struct
 import time
 import typing
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 from mcap.data_stream import RecordBuilder
-from mcap.exceptions import McapError
-from mcap.records import Attachment, Channel, DataEnd, Footer, Metadata
-from mcap.records import Message as McapMessage
-from mcap.stream_reader import StreamReader
+from mcap.records import DataEnd, Footer, Metadata
 from mcap.writer import MCAP0_MAGIC, Writer
-from zstandard import ZstdError
 
 from shared.errors import SaccadeError
-from shared.messages import ARRAY_EXTENSION, ArraySpec, Message, MessageError, decode, field_types
-from shared.stepper import GapCounter
-from shared.topics import TRUTH, Topic, parse_key
+from shared.messages import ARRAY_EXTENSION, ArraySpec, Message, field_types
+from shared.migrations import FORMAT
+from shared.topics import Topic
 
 FLUSH_S = 0.4  # a chunk is closed this often: what a killed recorder may lose
 CONFIGURATION = "config.json"
 ENDED_EARLY = "ended_early"
-MAX_RECORD_BYTES = 512 * 1024 * 1024
-DAMAGE = (McapError, struct.error, ZstdError, ValueError, OverflowError, MemoryError)
+LOG = "log"  # metadata about the log itself: its format
 
 
 class RecordingStopped(SaccadeError):
@@ -67,7 +59,12 @@ class RunLog:
 
     def flush_if_due(self) -> None:
         """To be called at least every FLUSH_S seconds while nothing is written."""
-        if self._writer is not None and time.monotonic() - self._flushed_s >= FLUSH_S:
+        if time.monotonic() - self._flushed_s >= FLUSH_S:
+            self.flush()
+
+    def flush(self) -> None:
+        """Brings to the disk what was written so far."""
+        if self._writer is not None:
             self._flushed_s = time.monotonic()
             self._guarded(lambda: (self._writer.flush(), self._file.sync()))
 
@@ -91,7 +88,7 @@ class RunLog:
 
     def _start(self, configuration: str, metadata: Mapping[str, Mapping[str, str]]) -> None:
         self._writer.start()
-        for name, values in metadata.items():
+        for name, values in {LOG: {"format": FORMAT}, **metadata}.items():
             self._writer.add_metadata(name, {str(k): str(v) for k, v in values.items()})
         now = time.time_ns()
         self._writer.add_attachment(now, now, CONFIGURATION, "application/json", configuration.encode())
@@ -146,108 +143,6 @@ class _WholeRecords:
 
     def close(self) -> None:
         self._raw.close()
-
-
-class Recorded(NamedTuple):
-    """One entry of a log."""
-
-    topic: Topic
-    part: str | None
-    payload: bytes
-    log_time_ns: int
-
-
-class RunReader:
-    """Reads a log in the order of arrival. `cut` says, once it is read, why it ends before its end (None: it is whole);
-    `refused` counts entries that are no valid messages. Raises SaccadeError for a file that is no log."""
-
-    def __init__(self, path: Path) -> None:
-        self.path, self.world = path, ""
-        self.cut: str | None = None
-        self.refused = 0
-        self.metadata: dict[str, dict[str, str]] = {}
-        self.configuration: str | None = None
-        try:
-            with path.open("rb") as stream:
-                head = stream.read(len(MCAP0_MAGIC))
-        except OSError as error:
-            raise SaccadeError(f"log {path} cannot be read: {error.strerror}") from error
-        if head != MCAP0_MAGIC:
-            kind = "empty: nothing was recorded" if not head else "not an MCAP file"
-            raise SaccadeError(f"log {path} is {kind}")
-
-    def __iter__(self) -> Iterator[tuple[Topic, str | None, Message]]:
-        """Every valid message."""
-        for entry in self.entries():
-            try:
-                yield entry.topic, entry.part, decode(entry.topic.type, entry.payload)
-            except MessageError:
-                self.refused += 1
-
-    def entries(self) -> Iterator[Recorded]:
-        """Every entry as it was recorded, valid or not."""
-        self.cut, self.refused, channels = None, 0, {}
-        with self.path.open("rb") as stream:
-            try:
-                reader = StreamReader(stream, validate_crcs=True, record_size_limit=MAX_RECORD_BYTES)
-                for record in reader.records:
-                    if isinstance(record, Channel):
-                        with contextlib.suppress(SaccadeError):  # a channel that someone else added
-                            self.world, *channels[record.id] = parse_key(record.topic)
-                    elif isinstance(record, McapMessage) and record.channel_id in channels:
-                        yield Recorded(*channels[record.channel_id], record.data, record.log_time)
-                    elif isinstance(record, Attachment) and record.name == CONFIGURATION:
-                        self.configuration = record.data.decode()
-                    elif isinstance(record, Metadata):
-                        self.metadata[record.name] = dict(record.metadata)
-            except DAMAGE as error:
-                self.cut = f"log {self.path} is cut or damaged ({type(error).__name__}); it is read up to there"
-        if self.cut is None and ENDED_EARLY in self.metadata:
-            self.cut = f"log {self.path} ended early: {self.metadata[ENDED_EARLY].get('reason', '')}"
-
-
-@dataclass
-class Missing:
-    """What a log lacks. `lost`: messages per key, by sequence number. `absent`: (run, episode, step, key) of topics
-    that every step should have. `cut`: why the file is not whole."""
-
-    messages: int = 0
-    lost: dict[str, int] = field(default_factory=dict)
-    absent: list[tuple[str, int, int, str]] = field(default_factory=list)
-    refused: int = 0
-    cut: str | None = None
-
-    @property
-    def complete(self) -> bool:
-        """Nothing is missing."""
-        return not (self.lost or self.absent or self.refused or self.cut)
-
-
-def missing(path: Path) -> Missing:
-    """Reads a log and reports gaps. The last step of an episode that is done needs no answer to its frame."""
-    report, reader, gaps = Missing(), RunReader(path), GapCounter(from_start=True)
-    steps: dict[tuple[str, int, int], set[str]] = {}
-    done: set[tuple[str, int, int]] = set()
-    keys: set[str] = set()
-    for topic, part, message in reader:
-        report.messages += 1
-        key = topic.key(reader.world, part)
-        if lost := gaps.lost(topic, part, message):
-            report.lost[key] = report.lost.get(key, 0) + lost
-        if topic.in_step and not topic.latched:
-            at = (message.run, message.episode, message.step)
-            keys.add(key)
-            steps.setdefault(at, set()).add(key)
-            if topic == TRUTH and message.done:
-                done.add(at)
-    for run, episode in {at[:2] for at in steps}:
-        for step in range(max(at[2] for at in steps if at[:2] == (run, episode)) + 1):
-            at = (run, episode, step)
-            if at not in done:
-                report.absent += [(*at, key) for key in sorted(keys - steps.get(at, set()))]
-    report.absent.sort()
-    report.refused, report.cut = reader.refused, reader.cut
-    return report
 
 
 def json_schema(message_type: type[Message]) -> dict[str, Any]:

@@ -47,16 +47,18 @@ class GapCounter:
         self._from_start = from_start  # whether the counter has listened since before the first message
         self._last: dict[tuple[str, str | None], tuple[str, int, int]] = {}  # run, episode, seq
 
-    def lost(self, topic: Topic, part: str | None, message: Message) -> int | None:
-        """How many messages of this key are missing just before this one; None for one that was there already."""
+    def lost(self, topic: Topic, part: str | None, message: Message, *, note: bool = True) -> int | None:
+        """How many messages of this key are missing just before this one; None for one that was there already.
+        Without `note` it is only looked at."""
         key, now = (topic.name, part), (message.run, message.episode, message.seq)
         known = self._last.get(key)
-        if not topic.in_step:
+        again = topic.in_step and known is not None and known[0] == now[0] and now[1:] <= known[1:]
+        if note and not again:
             self._last[key] = now
+        if not topic.in_step:
             return max(0, now[2] - known[2] - 1) if known else 0
-        if known is not None and known[0] == now[0] and now[1:] <= known[1:]:
+        if again:
             return None
-        self._last[key] = now
         if known is not None and known[:2] == now[:2]:
             return now[2] - known[2] - 1
         return now[2] if self._from_start or known is not None else 0

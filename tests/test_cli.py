@@ -19,12 +19,13 @@ from rich.console import Console
 import deploy.cli as cli
 from deploy.display import Progress, line, panel
 from deploy.doctor import Check, Finding, examine
+from deploy.logs.check import missing
 from deploy.run import run
 from services.simulator.scenes import PAPER_SCENES
 from shared.config import REPOSITORY, Config, load
 from shared.errors import SaccadeError
 from shared.messages import Belief, Plan, Status, Truth
-from shared.recording import RunReader, missing
+from shared.reading import RunReader
 from shared.topics import BELIEF, PLAN, STATUS, TOPICS, TRUTH
 from tests.fakes.weights import write_random_weights
 from tests.samples import sample

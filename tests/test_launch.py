@@ -14,12 +14,13 @@ from pathlib import Path
 import pytest
 
 from deploy.launch import PROCESSES, launch
+from deploy.logs.check import missing
 from shared.bus import ZenohBus, free_endpoint
 from shared.config import load
 from shared.errors import SaccadeError
 from shared.loop import run_local
 from shared.messages import Status
-from shared.recording import RunReader, missing
+from shared.reading import RunReader
 from shared.topics import FRAME, RESULT, STATUS
 from tests.fakes.launch import FAKES, PARTS, configuration
 from tests.fakes.services import pairs

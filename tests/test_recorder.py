@@ -11,10 +11,11 @@ import time
 from contextlib import closing
 from pathlib import Path
 
+from deploy.logs.check import missing
 from shared.bus import ZenohBus, free_endpoint
 from shared.config import Config
 from shared.messages import encode
-from shared.recording import RunReader, missing
+from shared.reading import RunReader
 from shared.topics import ACTION, PERCEPT, STATUS
 from tests.samples import sample
 

@@ -11,9 +11,12 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 
+from deploy.logs.check import missing
 from shared.errors import SaccadeError
 from shared.messages import encode, field_types
-from shared.recording import RecordingStopped, RunLog, RunReader, json_schema, missing
+from shared.migrations import FORMAT
+from shared.reading import RunReader
+from shared.recording import RecordingStopped, RunLog, json_schema
 from shared.topics import ACTION, BELIEF, FRAME, PERCEPT, STATUS, TOPICS, TRUTH
 from tests.samples import sample
 
@@ -41,7 +44,7 @@ def test_every_topic_comes_back_as_it_was(tmp_path):
     assert [(e.topic, e.part, e.payload) for e in reader.entries()] == [(t, p, encode(m)) for t, p, m in messages]
     assert [(t, p, encode(m)) for t, p, m in reader] == [(t, p, encode(m)) for t, p, m in messages]
     assert (reader.cut, reader.refused, reader.world) == (None, 0, "test")
-    assert reader.metadata == {"versions": {"x": "1"}}
+    assert reader.metadata == {"log": {"format": str(FORMAT)}, "versions": {"x": "1"}}
     assert json.loads(reader.configuration) == {"seed": 1}
 
 
