@@ -147,6 +147,10 @@ class Display:
         if not self.plain:
             self._live.stop()
 
+    def say(self, text: str) -> None:
+        """A line that stays: what befell a service."""
+        self.console.print(text, markup=False, highlight=False, soft_wrap=True)
+
     def take(self, topic: Topic, part: str | None, message: Message) -> None:
         """To be called with every message of the run."""
         self.progress.take(topic, part, message)

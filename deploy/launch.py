@@ -2,56 +2,44 @@
 
 from __future__ import annotations
 
-import os
 import queue
 import signal
-import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
 
-from deploy.threads import VARIABLES
+from deploy.supervisor import CONFIG_NAME, LOGS_NAME, Process, Supervisor
 from services.simulator.objects import names_of
-from shared.bus import ZenohBus, free_endpoint
-from shared.config import REPOSITORY, Config
+from shared.bus import Bus, ZenohBus, free_endpoint
+from shared.config import Config
 from shared.errors import SaccadeError
 from shared.loop import READY_STATES
 from shared.messages import Message, MessageError, Result, decode
-from shared.process import LAUNCHER_VARIABLE
+from shared.stepper import GapCounter
 from shared.topics import RESULT, STATUS, Topic
 
 OnMessage = Callable[[Topic, str | None, Message], None]
-CONFIG_NAME = "config.json"
 LOG_NAME = "run.mcap"
-LOGS_NAME = "logs"
 READY_S = 120.0  # loading weights on a busy machine takes its time
-STOP_S = 10.0  # then a service that was told to stop is killed
 POLL_S = 0.2
+QUIET_S = 2.0  # without news a result is asked for: it may have been published while the router was away
 
-
-@dataclass(frozen=True)
-class Process:
-    """One service's process: `python -m <module>`."""
-
-    name: str
-    module: str
-
-
-# In the order of the data: stopped in this order, each works off what the one before it has sent.
-PROCESSES = tuple(Process(name, f"services.{name}") for name in (
-    "simulator", "perception", "belief", "planner", "evaluator", "recorder"))
+# The router, then the others in the order of the data.
+ROUTER, *SERVICES = PROCESSES = tuple(Process(name, f"services.{name}") for name in (
+    "router", "simulator", "perception", "belief", "planner", "evaluator", "recorder"))
 
 
 def launch(config: Config, run_dir: Path, on_message: OnMessage | None = None,
-           processes: Sequence[Process] = PROCESSES) -> list[Result]:
+           processes: Sequence[Process] = PROCESSES, say: Callable[[str], None] | None = None) -> list[Result]:
     """Runs all episodes, one process per service, and returns their results in order; the log is `run_dir`/run.mcap.
 
-    `on_message(topic, part, message)` sees every valid message, on the caller's thread. The first process is the
-    source. Raises SaccadeError, naming the service, if one ends before its time or is not ready within READY_S.
+    `on_message(topic, part, message)` sees every valid message once, on the caller's thread; `say(text)` is told of
+    services that died and were started again, and of those that hang. The first process is the router, the second the
+    source. Raises SaccadeError, naming the service, if one says why it cannot run, dies too often or is not ready
+    within READY_S.
     """
     _prepare(run_dir)
     config = resolve(config, processes)
@@ -59,17 +47,21 @@ def launch(config: Config, run_dir: Path, on_message: OnMessage | None = None,
     arrived: queue.SimpleQueue = queue.SimpleQueue()
     with ExitStack() as stack:
         stack.enter_context(_terminable())
-        bus = ZenohBus(config.bus.endpoint, world=config.bus.world, listen=True)
+        supervisor = Supervisor(run_dir, say or (lambda text: print(f"saccade: {text}", file=sys.stderr)))
+        stack.callback(supervisor.stop)
+        supervisor.start(processes[0])
+        bus = ZenohBus(config.bus.endpoint, world=config.bus.world)
         stack.callback(bus.close)
         bus.subscribe(None if on_message else (STATUS, RESULT), lambda *item: arrived.put(item))
-        children: dict[str, subprocess.Popen] = {}
-        stack.callback(_stop, children)
-        for process in processes:
-            children[process.name] = _start(process, run_dir)
-        results = _follow(_messages(arrived, children, run_dir), processes, on_message)
-        _stop(children)
-        _drain(arrived, on_message)
-        _warn(children, run_dir)
+        messages = _messages(arrived, bus, supervisor, run_dir.name)
+        _await_router(messages, processes[0])
+        for process in processes[1:]:
+            supervisor.start(process)
+        results = _follow(messages, processes, on_message)
+        supervisor.stop()
+        _drain(messages, on_message)
+        for complaint in supervisor.complaints():  # what went wrong beside the results (a full disk under the log)
+            print(f"saccade: {complaint}", file=sys.stderr)
     return results
 
 
@@ -77,7 +69,7 @@ def resolve(config: Config, processes: Sequence[Process] = PROCESSES) -> Config:
     """The configuration as the processes read it: objects named, a free port, who must be ready first."""
     names = config.scene.names or names_of(config.scene.objects)
     return config.with_values({"bus.endpoint": free_endpoint(config.bus.endpoint), "scene.names": list(names),
-                               "bus.wait_for": [process.name for process in processes[1:]]})
+                               "bus.wait_for": [process.name for process in processes[2:]]})
 
 
 def _prepare(run_dir: Path) -> None:
@@ -89,35 +81,42 @@ def _prepare(run_dir: Path) -> None:
         raise SaccadeError(f"run folder {run_dir} cannot be made: {error.strerror}") from error
 
 
-def _start(process: Process, run_dir: Path) -> subprocess.Popen:
-    path = os.pathsep.join(filter(None, (str(REPOSITORY), os.environ.get("PYTHONPATH"))))
-    environment = {**dict.fromkeys(VARIABLES, "1"), **os.environ, "PYTHONPATH": path,
-                   LAUNCHER_VARIABLE: str(os.getpid())}
-    with _log_path(run_dir, process.name).open("wb") as log:
-        return subprocess.Popen(  # a session of its own: Ctrl-C reaches the launcher, which then stops all in order
-            [sys.executable, "-m", process.module, "--config", str(run_dir / CONFIG_NAME)], env=environment,
-            stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, start_new_session=True)
-
-
-def _messages(arrived: queue.SimpleQueue, children: dict[str, subprocess.Popen], run_dir: Path) -> Iterator:
-    """(topic, part, message) as they arrive, and None when nothing did; raises SaccadeError if a child has ended."""
-    looked_s = time.monotonic()
+def _messages(arrived: queue.SimpleQueue, bus: Bus, supervisor: Supervisor, run: str) -> Iterator:
+    """(topic, part, message) as they arrive, each once, and None when nothing did."""
+    gaps, looked_s, news_s = GapCounter(), time.monotonic(), time.monotonic()
     while True:
-        if time.monotonic() - looked_s >= POLL_S:
-            looked_s = time.monotonic()
-            for name, child in children.items():
-                if child.poll() is not None:
-                    raise SaccadeError(f"{name}: {_last_line(run_dir, name, child.returncode)}")
+        now_s = time.monotonic()
+        if now_s - looked_s >= POLL_S:
+            looked_s = now_s
+            supervisor.check()
+        if now_s - news_s >= QUIET_S:
+            news_s = now_s
+            for topic, part, payload, *_ in bus.recall((RESULT,), (run, 0, 0)):
+                arrived.put((topic, part, payload))
         item = None
         with suppress(queue.Empty, MessageError):  # whoever subscribes to an invalid message counts it
             topic, part, payload = arrived.get(timeout=POLL_S)
-            item = (topic, part, decode(topic.type, payload))
+            message = decode(topic.type, payload)
+            if topic == STATUS:
+                supervisor.heard(part)
+            if gaps.lost(topic, part, message) is not None:
+                item = (topic, part, message)
+                news_s = news_s if topic == STATUS else now_s
         yield item
+
+
+def _await_router(messages: Iterator, router: Process) -> None:
+    deadline_s = time.monotonic() + READY_S
+    for item in messages:
+        if item is not None and item[0] == STATUS and item[1] == router.name and item[2].state in READY_STATES:
+            return
+        if time.monotonic() > deadline_s:
+            raise SaccadeError(f"{router.name}: not ready after {READY_S:.0f} s; see {LOGS_NAME}/")
 
 
 def _follow(messages: Iterator, processes: Sequence[Process], on_message: OnMessage | None) -> list[Result]:
     results: dict[int, Result] = {}
-    starting = {process.name for process in processes}
+    starting = {process.name for process in processes[1:]}
     episodes, deadline_s = None, time.monotonic() + READY_S
     for item in messages:
         if starting and time.monotonic() > deadline_s:
@@ -131,52 +130,17 @@ def _follow(messages: Iterator, processes: Sequence[Process], on_message: OnMess
             results[message.episode] = message
         elif topic == STATUS and message.state in READY_STATES:
             starting.discard(part)
-        elif topic == STATUS and part == processes[0].name and message.state == "finished":
+        elif topic == STATUS and part == processes[1].name and message.state == "finished":
             episodes = message.episode + 1
         if episodes is not None and len(results) >= episodes:
             break
     return [results[episode] for episode in sorted(results)]
 
 
-def _stop(children: dict[str, subprocess.Popen]) -> None:
-    for child in children.values():
-        try:
-            if child.poll() is None:
-                child.terminate()
-                child.wait(STOP_S)
-        except subprocess.TimeoutExpired:
-            child.kill()
-            child.wait()
-        except BaseException:  # interrupted once more: no orphans, whatever happens
-            for other in children.values():
-                other.kill()
-                other.wait()
-            raise
-
-
-def _drain(arrived: queue.SimpleQueue, on_message: OnMessage | None) -> None:
-    while on_message is not None and not arrived.empty():
-        topic, part, payload = arrived.get()
-        with suppress(MessageError):
-            on_message(topic, part, decode(topic.type, payload))
-
-
-def _warn(children: dict[str, subprocess.Popen], run_dir: Path) -> None:
-    """The results are there; what went wrong beside them (a full disk under the log) is said, not raised."""
-    for name, child in children.items():
-        if child.returncode:
-            print(f"saccade: {name}: {_last_line(run_dir, name, child.returncode)}", file=sys.stderr)
-
-
-def _log_path(run_dir: Path, name: str) -> Path:
-    return run_dir / LOGS_NAME / f"{name}.log"
-
-
-def _last_line(run_dir: Path, name: str, code: int) -> str:
-    lines = _log_path(run_dir, name).read_text(errors="replace").strip().splitlines()
-    reason = lines[-1].removeprefix("saccade: ") if lines else "it said nothing"
-    how = f"ended with code {code}" if code >= 0 else f"was ended by signal {signal.Signals(-code).name}"
-    return f"{reason} (it {how}; see {_log_path(run_dir, name)})"
+def _drain(messages: Iterator, on_message: OnMessage | None) -> None:
+    """What was still on its way when the services were stopped."""
+    while on_message is not None and (item := next(messages)) is not None:
+        on_message(*item)
 
 
 @contextmanager

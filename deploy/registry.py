@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from importlib import import_module
 
-from deploy.launch import PROCESSES, Process
+from deploy.launch import PROCESSES
+from deploy.supervisor import Process
 from deploy.threads import limit_torch
 from shared.config import Config
 from shared.errors import SaccadeError
@@ -13,7 +14,7 @@ from shared.service import Core, Service
 
 Pair = tuple[Service, Core]
 
-SOURCE, JUDGE, RECORDER = "simulator", "evaluator", "recorder"
+ROUTER, SOURCE, JUDGE, RECORDER = "router", "simulator", "evaluator", "recorder"
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,7 @@ def agent_processes(agent: str) -> tuple[Process, ...]:
     chosen = agent_of(agent)
     if chosen.cores:
         raise SaccadeError(f"agent {agent!r} runs within one process only: add `--bus local`")
-    wanted = {SOURCE, *chosen.services, JUDGE, RECORDER}
+    wanted = {ROUTER, SOURCE, *chosen.services, JUDGE, RECORDER}
     return tuple(process for process in PROCESSES if process.name in wanted)
 
 

@@ -9,8 +9,9 @@ from pathlib import Path
 from rich.console import Console
 
 from deploy.display import Display, Progress, spread_cm
-from deploy.launch import CONFIG_NAME, launch
+from deploy.launch import launch
 from deploy.registry import agent_of, agent_processes, local_pairs
+from deploy.supervisor import CONFIG_NAME
 from services.recorder.core import LOG_NAME, describe
 from services.simulator.core import names_in_use
 from shared.config import Config
@@ -34,7 +35,7 @@ def run(config: Config, *, agent: str, out: Path | None, plain: bool, console: C
     judged = not config.scene.explore and config.scene.goal_image is None
     with Display(console, plain=plain, judged=judged) as display:
         if processes:
-            results = launch(config, folder, display.take, processes)
+            results = launch(config, folder, display.take, processes, display.say)
         else:
             results = run_here(config, agent, folder, display)
     for text in _ending(config, results, display.progress):

@@ -1,15 +1,17 @@
-"""python -m tests.fakes.launch RUN_DIR EPISODES STEPS [WISH]: the fakes and the real recorder as a real run."""
+"""python -m tests.fakes.launch RUN_DIR EPISODES STEPS [WISH]: the fakes between the real router and the real recorder."""
 
 from __future__ import annotations
 
 import sys
 from pathlib import Path
 
-from deploy.launch import PROCESSES, Process, launch
+from deploy.launch import PROCESSES, launch
+from deploy.supervisor import Process
 from shared.config import Config
 from shared.errors import SaccadeError
 
-FAKES = tuple(p if p.name == "recorder" else Process(p.name, f"tests.fakes.{p.name}") for p in PROCESSES)
+REAL = ("router", "recorder")
+FAKES = tuple(p if p.name in REAL else Process(p.name, f"tests.fakes.{p.name}") for p in PROCESSES)
 PARTS = ("mug", "can")
 
 

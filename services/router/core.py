@@ -1,0 +1,29 @@
+"""The router: a Zenoh session that listens. It may die and come back: who was connected connects again."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from shared.bus import ZenohBus
+from shared.config import Config
+from shared.process import Health, Heartbeat, Inbox, run_process
+
+NAME = "router"
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """The router's process. Exit code 2 if the endpoint is taken."""
+    run_process(NAME, _work, argv=argv)
+
+
+def _work(config: Config, folder: Path, inbox: Inbox) -> None:
+    bus = ZenohBus(config.bus.endpoint, world=config.bus.world, listen=True)
+    try:
+        health = Health(NAME, at=(folder.name, 0, 0))
+        with Heartbeat(bus, health, inbox.stop):
+            health.say("ready")
+            for _ in inbox.items(drain_s=0.0):
+                pass
+    finally:
+        bus.close()
