@@ -18,7 +18,7 @@ from shared.config import Config
 from shared.errors import SaccadeError
 from shared.loop import READY_STATES
 from shared.messages import Message, MessageError, Result, decode
-from shared.stepper import GapCounter
+from shared.sequences import Sequences
 from shared.topics import RESULT, STATUS, Topic
 
 OnMessage = Callable[[Topic, str | None, Message], None]
@@ -57,7 +57,7 @@ def launch(config: Config, run_dir: Path, on_message: OnMessage | None = None,
         _await_router(messages, processes[0])
         for process in processes[1:]:
             supervisor.start(process)
-        results = _follow(messages, processes, on_message)
+        results = _follow(messages, processes, on_message, supervisor)
         supervisor.stop()
         _drain(messages, on_message)
         for complaint in supervisor.complaints():  # what went wrong beside the results (a full disk under the log)
@@ -83,7 +83,7 @@ def _prepare(run_dir: Path) -> None:
 
 def _messages(arrived: queue.SimpleQueue, bus: Bus, supervisor: Supervisor, run: str) -> Iterator:
     """(topic, part, message) as they arrive, each once, and None when nothing did."""
-    gaps, looked_s, news_s = GapCounter(), time.monotonic(), time.monotonic()
+    sequences, looked_s, news_s = Sequences(), time.monotonic(), time.monotonic()
     while True:
         now_s = time.monotonic()
         if now_s - looked_s >= POLL_S:
@@ -98,8 +98,8 @@ def _messages(arrived: queue.SimpleQueue, bus: Bus, supervisor: Supervisor, run:
             topic, part, payload = arrived.get(timeout=POLL_S)
             message = decode(topic.type, payload)
             if topic == STATUS:
-                supervisor.heard(part)
-            if gaps.lost(topic, part, message) is not None:
+                supervisor.heard(part, message.state)
+            if sequences.take(topic, part, message) is not None:
                 item = (topic, part, message)
                 news_s = news_s if topic == STATUS else now_s
         yield item
@@ -114,13 +114,16 @@ def _await_router(messages: Iterator, router: Process) -> None:
             raise SaccadeError(f"{router.name}: not ready after {READY_S:.0f} s; see {LOGS_NAME}/")
 
 
-def _follow(messages: Iterator, processes: Sequence[Process], on_message: OnMessage | None) -> list[Result]:
+def _follow(messages: Iterator, processes: Sequence[Process], on_message: OnMessage | None,
+            supervisor: Supervisor) -> list[Result]:
     results: dict[int, Result] = {}
     starting = {process.name for process in processes[1:]}
     episodes, deadline_s = None, time.monotonic() + READY_S
     for item in messages:
         if starting and time.monotonic() > deadline_s:
             raise SaccadeError(f"{', '.join(sorted(starting))}: not ready after {READY_S:.0f} s; see {LOGS_NAME}/")
+        if episodes is not None and len(results) >= episodes and supervisor.settled:
+            break
         if item is None:
             continue
         topic, part, message = item
@@ -132,8 +135,6 @@ def _follow(messages: Iterator, processes: Sequence[Process], on_message: OnMess
             starting.discard(part)
         elif topic == STATUS and part == processes[1].name and message.state == "finished":
             episodes = message.episode + 1
-        if episodes is not None and len(results) >= episodes:
-            break
     return [results[episode] for episode in sorted(results)]
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from deploy.threads import VARIABLES
 from shared.config import REPOSITORY
 from shared.errors import SaccadeError
-from shared.process import EXIT_ERROR, LAUNCHER_VARIABLE
+from shared.process import EXIT_ERROR, LAUNCHER_VARIABLE, STARTING
 
 CONFIG_NAME = "config.json"
 LOGS_NAME = "logs"
@@ -23,6 +23,7 @@ STOP_S = 10.0  # then a service that was told to stop is killed
 RESTARTS, RESTARTS_S = 5, 60.0  # so often within so long a service is started again, no more
 HUNG_S = 2.0  # without a heartbeat, of which there are two a second
 HUNG_KILLED_S = 10.0
+SETTLED_S = 5.0  # after which a service that died has been told what it missed
 BACK_S = 6.0  # what a router's return takes the others
 
 
@@ -42,6 +43,7 @@ class Supervisor:
         self._processes: dict[str, Process] = {}
         self._children: dict[str, subprocess.Popen] = {}
         self._heard_s: dict[str, float] = {}  # since a service was (re)started: when it was last heard of
+        self._up: set[str] = set()  # those that have started, and not ended since
         self._silent: set[str] = set()
         self._stopped = False
         self._restarts: dict[str, deque[float]] = defaultdict(deque)
@@ -54,15 +56,25 @@ class Supervisor:
         self._processes[process.name] = process
         self._heard_s.pop(process.name, None)
         self._silent.discard(process.name)
+        self._up.discard(process.name)
         with self.log_path(process.name).open("ab") as log:
             self._children[process.name] = subprocess.Popen(
                 [sys.executable, "-m", process.module, "--config", str(self._run_dir / CONFIG_NAME)], env=environment,
                 stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, start_new_session=True)
 
-    def heard(self, name: str) -> None:
+    @property
+    def settled(self) -> bool:
+        """Whether all services are up, and the last of those that died has been back for a while."""
+        last_s = max((past[-1] for past in self._restarts.values() if past), default=-SETTLED_S)
+        return (time.monotonic() - last_s >= SETTLED_S and self._up == set(self._children)
+                and all(child.poll() is None for child in self._children.values()))
+
+    def heard(self, name: str, state: str) -> None:
         """A heartbeat has come."""
         if name in self._children:
             self._heard_s[name] = time.monotonic()
+            if state != STARTING:
+                self._up.add(name)
             if name in self._silent:
                 self._silent.discard(name)
                 self._say(f"{name} is heard again")

@@ -22,7 +22,7 @@ from shared.topics import ROOT, Topic, parse_key
 Deliver = Callable[[Topic, str | None, bytes], None]  # runs on the bus's thread: must only put its arguments somewhere
 Answer = Callable[[Iterable[Topic], Since | None, int], list[Kept]]
 
-RECALL_S = 5.0  # for an answer to be whole: a publisher that hangs must not hang who asks it
+RECALL_S = 3.0  # for an answer to be whole: a publisher that hangs must not hang who asks it
 
 
 class Bus(Protocol):

@@ -13,8 +13,9 @@ from shared.errors import SaccadeError
 from shared.messages import Message, MessageError, decode, encode
 from shared.outbox import Outbox
 from shared.process import DRAIN_S, Health, Heartbeat, Inbox, run_process
+from shared.sequences import Sequences
 from shared.service import Core, Output, Service
-from shared.stepper import GapCounter, Stepper, settle
+from shared.stepper import Stepper, settle
 from shared.topics import STATUS, Topic
 
 OnMessage = Callable[[Topic, str | None, Message, bytes | None], None]
@@ -62,12 +63,16 @@ def serve(service: Service, core: Core, bus: Bus, parts: tuple[str, ...], *, run
         loop.health.say("ready", WAITS + ", ".join(sorted(loop.awaited)) if loop.awaited else "")
         loop.begin_if_due()
         loop.catch_up()
+        news_s = time.monotonic()
         for item in inbox.items(0.0 if source else DRAIN_S, tick_s=IDLE_S):
-            if item is None:
+            if item is not None:
+                loop.handle(*item, more=live and inbox.waiting)
+            if item is not None and item[0] != STATUS:
+                news_s = time.monotonic()
+            elif time.monotonic() - news_s >= IDLE_S:
+                news_s = time.monotonic()
                 loop.catch_up()
                 loop.say_what_lacks()
-            else:
-                loop.handle(*item, more=live and inbox.waiting)
     return loop.health
 
 
@@ -80,7 +85,7 @@ class _Loop:
         self.topics = service.inputs + ((service.closed_by,) if service.closed_by else ())
         self._source = stepper.episode_done  # between episodes from the start
         self._stepper, self._bus, self._run, self._service = stepper, bus, run, service
-        self._gaps = GapCounter()
+        self._sequences = Sequences()
         self._next_episode, self._closed = 0, -1
 
     def handle(self, topic: Topic, part: str | None, payload: bytes, *, more: bool = False) -> None:
@@ -91,7 +96,7 @@ class _Loop:
         self.health.received += 1
         try:
             message = decode(topic.type, payload)
-            self.health.gaps += self._gaps.lost(topic, part, message) or 0
+            self.health.gaps += self._sequences.take(topic, part, message) or 0
             if topic == self._service.closed_by:
                 self._close(message)
                 return

@@ -25,6 +25,7 @@ SHORTEST_S = 0.05  # between two statuses, however many messages are refused
 QUIET_S = 0.1  # a service told to stop first works off what is already on its way: until nothing came for so long,
 DRAIN_S = 1.0  # or for so long in all
 EXIT_ERROR = 2
+STARTING = "starting"
 LAUNCHER_VARIABLE = "SACCADE_LAUNCHER"  # the launcher's process id: the service stops if that is no longer its parent
 
 Item = tuple[Topic, str | None, bytes]
@@ -87,7 +88,7 @@ class Health:
     """What a service says about itself; plain numbers written by its main thread, read by the heartbeat."""
 
     service: str
-    state: str = "starting"
+    state: str = STARTING
     note: str = ""
     at: tuple[str, int, int] = ("", 0, 0)  # run, episode, step
     received: int = 0

@@ -13,6 +13,7 @@ import numpy as np
 
 from shared.errors import SaccadeError
 from shared.messages import Message, MessageError
+from shared.sequences import Stamper
 from shared.service import Core, Output, Service
 from shared.topics import TRUTH, Topic
 
@@ -20,48 +21,6 @@ MAX_PENDING = 256  # incomplete steps kept, so that a flood of stray messages ca
 
 Episode = tuple[str, int]  # run and number
 Slot = dict[str, dict[str | None, Message]]  # topic name -> part -> message
-
-
-class Stamper:
-    """Numbers the messages of an episode per key, in the order in which they are made."""
-
-    def __init__(self) -> None:
-        self._next: dict[tuple[str, str | None], int] = {}
-
-    def stamp(self, output: Output) -> Output:
-        """The output with its sequence number."""
-        key = (output.topic.name, output.part)
-        seq = self._next.get(key, 0)
-        self._next[key] = seq + 1
-        return dataclasses.replace(output, message=dataclasses.replace(output.message, seq=seq))
-
-
-class GapCounter:
-    """Tells from sequence numbers how many messages of a key were lost.
-
-    They count from 0 in every episode, so that a service that was started again gives the same ones. A status counts
-    from 0 in every process.
-    """
-
-    def __init__(self, *, from_start: bool = False) -> None:
-        self._from_start = from_start  # whether the counter has listened since before the first message
-        self._last: dict[tuple[str, str | None], tuple[str, int, int]] = {}  # run, episode, seq
-
-    def lost(self, topic: Topic, part: str | None, message: Message, *, note: bool = True) -> int | None:
-        """How many messages of this key are missing just before this one; None for one that was there already.
-        Without `note` it is only looked at."""
-        key, now = (topic.name, part), (message.run, message.episode, message.seq)
-        known = self._last.get(key)
-        again = topic.in_step and known is not None and known[0] == now[0] and now[1:] <= known[1:]
-        if note and not again:
-            self._last[key] = now
-        if not topic.in_step:
-            return max(0, now[2] - known[2] - 1) if known else 0
-        if again:
-            return None
-        if known is not None and known[:2] == now[:2]:
-            return now[2] - known[2] - 1
-        return now[2] if self._from_start or known is not None else 0
 
 
 class Stepper:

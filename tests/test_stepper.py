@@ -9,8 +9,8 @@ import pytest
 
 from shared.messages import MessageError, encode
 from shared.service import Service
-from shared.stepper import GapCounter, Stepper, settle
-from shared.topics import ACTION, FRAME, GOAL, PERCEPT, PLAN, STATUS, TRUTH
+from shared.stepper import Stepper, settle
+from shared.topics import ACTION, FRAME, GOAL, PERCEPT, PLAN, TRUTH
 from tests.fakes.services import SIMULATOR, FakeSimulator
 from tests.samples import sample
 
@@ -134,22 +134,6 @@ def test_stray_steps_do_not_pile_up():
         offer(stepper, GOAL, episode=step)
     assert len(stepper._slots) + len(stepper._latched) < 600
     assert stepper.skipped > 700
-
-
-def test_gaps_are_counted_per_key():
-    counter = GapCounter()
-    lost = [counter.lost(PERCEPT, part, sample(PERCEPT.type, run="r", seq=seq))
-            for part, seq in (("mug", 4), ("can", 0), ("mug", 5), ("can", 3), ("mug", 9), ("mug", 0), ("mug", 9))]
-    assert lost == [0, 0, 0, 2, 3, None, None]
-    later = [counter.lost(PERCEPT, "mug", sample(PERCEPT.type, run="r", episode=e, seq=s))
-             for e, s in ((4, 2), (3, 11), (4, 3))]
-    assert later == [2, None, 0]
-    assert GapCounter(from_start=True).lost(PERCEPT, "mug", sample(PERCEPT.type, seq=4)) == 4
-
-
-def test_a_status_counts_anew_in_a_process_that_was_started_again():
-    counter = GapCounter()
-    assert [counter.lost(STATUS, "belief", sample(STATUS.type, seq=seq)) for seq in (7, 8, 0, 1, 3)] == [0, 0, 0, 0, 1]
 
 
 def test_settled_arrays_are_aligned_frozen_and_no_ones_else():

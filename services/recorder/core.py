@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import itertools
 import platform
 import sys
+import time
 from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
@@ -20,13 +20,14 @@ from shared.process import Health, Heartbeat, Inbox, run_process
 from shared.provenance import commit
 from shared.reading import RunReader
 from shared.recording import FLUSH_S, RecordingStopped, RunLog
-from shared.stepper import GapCounter
+from shared.sequences import Sequences
 from shared.topics import TOPICS, Topic
 
 NAME = "recorder"
 LOG_NAME = "run.mcap"
 QUEUE_BYTES = 512 * 1024 * 1024
-FILLED_AT = (1, 4)  # ticks without a message after which the publishers are asked: at the start, and after a pause
+ASKED_AGAIN_S = 0.5
+QUIET_S = 1.5  # after so long without news the publishers are asked
 PACKAGES = ("saccade", "eclipse-zenoh", "mcap", "msgpack", "numpy", "mujoco", "torch")
 
 
@@ -56,25 +57,30 @@ class Recorder:
 
     def __init__(self, bus: Bus, folder: Path, config: Config) -> None:
         self.health, self._bus, self._run = Health(NAME), bus, folder.name
-        self._gaps = GapCounter(from_start=True)
-        self._newest = (0, 0)  # episode and step
+        self._sequences = Sequences(from_start=True)
+        self._last: dict[tuple[str, str | None], tuple[int, int]] = {}  # of each key: episode and step
+        self._asked_s, self._ask_again_s = 0.0, ASKED_AGAIN_S
         self.log = self._open(folder / LOG_NAME, config)
 
     def record(self, inbox: Inbox) -> Health:
         """Until the inbox is stopped. A log that can take no more does not stop the agent: it is said on the bus at
         once, and raised as RecordingStopped at the end."""
-        health, stopped, idle = self.health, None, 0
+        health, stopped, news_s = self.health, None, time.monotonic()
         with Heartbeat(self._bus, health, inbox.stop):
+            self._ask_for_news()
             health.say("ready")
-            for item in itertools.chain([None], inbox.items(tick_s=FLUSH_S)):
+            for item in inbox.items(tick_s=FLUSH_S):
                 try:
-                    idle = 0 if item else idle + 1
                     if item is not None:
                         self._take(*item)
                     else:
                         self.log.flush_if_due()
-                    if idle in FILLED_AT:
-                        self._fill()
+                    if item is not None and item[0].in_step:
+                        news_s = time.monotonic()
+                    elif time.monotonic() - news_s >= QUIET_S:
+                        news_s = time.monotonic()
+                        self._ask_for_news()
+                        self._ask_for_missing()
                 except RecordingStopped as error:
                     stopped = error
                     health.say("not recording", str(error))
@@ -106,18 +112,34 @@ class Recorder:
         self.health.received += 1
         try:
             message = decode(topic.type, payload)
-            if self._gaps.lost(topic, part, message, note=False):
-                self._fill()
+            if self._sequences.begins(topic, part, message):  # how the episode before it ended may have been lost
+                self._write_kept([topic], self._last[topic.name, part])
         except MessageError as error:  # recorded all the same: the log is what was on the wire
             self.health.refuse(topic, part, error)
         self._write(self.log, topic, part, payload)
         self.health.published = self.log.messages
+        self._ask_for_missing()
 
-    def _fill(self) -> None:
-        """Writes what the publishers know and the log does not have."""
-        topics = [topic for topic in TOPICS.values() if topic.in_step]
-        episode, step = self._newest
-        kept = self._bus.recall(topics, (self._run, episode, max(0, step - 1)), KEPT_BYTES)
+    def _ask_for_news(self) -> None:
+        """What came last may have been lost with nothing after it to tell."""
+        episode, step = max(self._last.values(), default=(0, 0))
+        self._write_kept([topic for topic in TOPICS.values() if topic.in_step], (episode, max(0, step - 1)))
+
+    def _ask_for_missing(self) -> None:
+        """Every now and then, less often the longer it is in vain: a publisher may have to find the bus again."""
+        missing = self._sequences.missing
+        self.health.gaps = sum(missing.values())
+        if not missing:
+            self._ask_again_s, self._asked_s = ASKED_AGAIN_S, 0.0
+        elif time.monotonic() - self._asked_s >= self._ask_again_s:
+            self._asked_s, self._ask_again_s = time.monotonic(), 2 * self._ask_again_s
+            self.health.say(note=f"{self.health.gaps} lost: " + ", ".join(sorted(
+                f"{name}{f'/{part}' if part else ''}" for name, part in missing)))
+            self._write_kept([TOPICS[name] for name in sorted({name for name, _ in missing})],
+                             (self._sequences.first_missing, 0))
+
+    def _write_kept(self, topics: Sequence[Topic], since: tuple[int, int]) -> None:
+        kept = self._bus.recall(topics, (self._run, *since), KEPT_BYTES)
         for topic, part, payload, _, published_ns in sorted(kept, key=lambda k: k.published_ns):
             self._write(self.log, topic, part, payload, published_ns)
 
@@ -125,15 +147,11 @@ class Recorder:
         sequence = 0
         with contextlib.suppress(MessageError):
             message = decode(topic.type, payload)
-            lost = self._gaps.lost(topic, part, message)
-            if lost is None:
+            if self._sequences.take(topic, part, message) is None:
                 return
-            if lost:
-                self.health.gaps += lost
-                self.health.say(note=f"{lost} lost before {topic.name}{f'/{part}' if part else ''} {message.seq}")
-            sequence = message.seq
+            sequence, key = message.seq, (topic.name, part)
             if topic.in_step and message.run == self._run:
-                self._newest = max(self._newest, (message.episode, message.step))
+                self._last[key] = max(self._last.get(key, (0, 0)), (message.episode, message.step))
         log.write(topic, part, payload, sequence=sequence, log_time_ns=time_ns)
 
 

@@ -22,8 +22,7 @@ from shared.service import Inputs, Output, Service
 from shared.task import MAX_STEPS, Episode, spheres_around
 from shared.topics import ACTION, FRAME, GOAL, RESULT, TRUTH
 
-SERVICE = Service("simulator", inputs=(ACTION,), trigger=ACTION, outputs=(FRAME, GOAL, TRUTH),
-                  closed_by=RESULT)
+SERVICE = Service("simulator", inputs=(ACTION,), trigger=ACTION, outputs=(FRAME, GOAL, TRUTH), closed_by=RESULT)
 
 
 class Simulator:

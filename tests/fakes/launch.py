@@ -1,4 +1,4 @@
-"""python -m tests.fakes.launch RUN_DIR EPISODES STEPS [WISH]: the fakes between the real router and the real recorder."""
+"""python -m tests.fakes.launch RUN_DIR EPISODES STEPS [WISH]: the fakes between the real router and recorder."""
 
 from __future__ import annotations
 

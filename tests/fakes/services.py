@@ -19,7 +19,8 @@ SIDE_PX = 96
 IDENTITY = np.eye(4)
 INTRINSICS_PX = np.array([100.0, 100.0, 48.0, 48.0])
 
-SIMULATOR = Service("simulator", inputs=(ACTION,), trigger=ACTION, outputs=(FRAME, GOAL, TRUTH))
+SIMULATOR = Service("simulator", inputs=(ACTION,), trigger=ACTION, outputs=(FRAME, GOAL, TRUTH),
+                    closed_by=RESULT)
 PERCEPTION = Service("perception", inputs=(FRAME, GOAL), trigger=FRAME, outputs=(PERCEPT, GOAL_PERCEPT))
 BELIEVER = Service("belief", inputs=(PERCEPT, GOAL_PERCEPT), trigger=PERCEPT, outputs=(BELIEF,))
 PLANNER = Service("planner", inputs=(BELIEF,), trigger=BELIEF, outputs=(PLAN, ACTION))

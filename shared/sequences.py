@@ -1,0 +1,73 @@
+"""Sequence numbers: per key, from 0 in every episode, so that a service that was started again gives the same ones."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from shared.messages import Message
+from shared.service import Output
+from shared.topics import Topic
+
+Key = tuple[str, str | None]  # topic and part
+Episode = tuple[str, int]  # run and number
+
+
+class Stamper:
+    """Numbers the messages of an episode per key, in the order in which they are made."""
+
+    def __init__(self) -> None:
+        self._next: dict[tuple[str, str | None], int] = {}
+
+    def stamp(self, output: Output) -> Output:
+        """The output with its sequence number."""
+        key = (output.topic.name, output.part)
+        seq = self._next.get(key, 0)
+        self._next[key] = seq + 1
+        return dataclasses.replace(output, message=dataclasses.replace(output.message, seq=seq))
+
+
+class Sequences:
+    """Which messages of each key were there. What is missing may still come, out of its turn.
+
+    A status is not part of an episode: it counts from 0 in every process, and nobody can ask for it again.
+    """
+
+    def __init__(self, *, from_start: bool = False) -> None:
+        self._from_start = from_start  # whether this listens since before the first message
+        self._next: dict[Key, dict[Episode, int]] = {}
+        self._missing: dict[Key, set[tuple[str, int, int]]] = {}
+
+    def take(self, topic: Topic, part: str | None, message: Message) -> int | None:
+        """How many messages of this key are missing just before this one; None for one that was there already."""
+        key, episode, seq = (topic.name, part), (message.run, message.episode), message.seq
+        if not topic.in_step:
+            known = self._next.get(key, {}).get(("", 0), seq)
+            self._next[key] = {("", 0): seq + 1}
+            return max(0, seq - known)
+        episodes = self._next.setdefault(key, {})
+        due = episodes.get(episode, 0 if episodes or self._from_start else seq)
+        if seq >= due:
+            episodes[episode] = seq + 1
+            if seq > due:
+                self._missing.setdefault(key, set()).update((*episode, lost) for lost in range(due, seq))
+            return seq - due
+        missing = self._missing.get(key, set())
+        if (*episode, seq) not in missing:
+            return None
+        missing.discard((*episode, seq))
+        return 0
+
+    @property
+    def missing(self) -> dict[Key, int]:
+        """How many messages of each key have not come."""
+        return {key: len(lost) for key, lost in self._missing.items() if lost}
+
+    @property
+    def first_missing(self) -> int:
+        """The first episode of which something has not come; 0 where all has."""
+        return min((episode for lost in self._missing.values() for _, episode, _ in lost), default=0)
+
+    def begins(self, topic: Topic, part: str | None, message: Message) -> bool:
+        """Whether this is the first message of its key in a later episode than those before it."""
+        known = self._next.get((topic.name, part), {})
+        return topic.in_step and bool(known) and (message.run, message.episode) not in known

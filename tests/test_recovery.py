@@ -1,0 +1,86 @@
+"""Whatever process is killed at whatever moment: the run goes on, and its log is that of an undisturbed run."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from deploy.launch import PROCESSES, launch
+from deploy.logs.check import missing
+from shared.loop import run_local
+from shared.reading import RunReader
+from shared.topics import FRAME, STATUS
+from tests.fakes.launch import FAKES, PARTS, configuration
+from tests.fakes.services import pairs
+
+EPISODES, STEPS = 3, 12
+NAMES = [process.name for process in PROCESSES]
+
+
+def process_of(run_dir: Path, name: str) -> int | None:
+    """The process id of a run's service."""
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            words = path.read_bytes().split(b"\0")
+        except OSError:
+            continue
+        if str(run_dir / "config.json").encode() in words and any(w.endswith(f".{name}".encode()) for w in words):
+            return int(path.parent.name)
+    return None
+
+
+def disturbed(run_dir: Path, at: dict[tuple[int, int], Callable[[], None]]) -> tuple[list, list[str]]:
+    """Results and notices of a run in which something happens when the frame of (episode, step) is seen."""
+    said = []
+
+    def on_message(topic, part, message):
+        if topic == FRAME and (message.episode, message.step) in at:
+            at[message.episode, message.step]()
+
+    results = launch(configuration(EPISODES, STEPS), run_dir, on_message, FAKES, said.append)
+    return results, said
+
+
+def logged(path: Path) -> dict:
+    keys = defaultdict(list)
+    for topic, part, payload, _ in RunReader(path).entries():
+        if topic != STATUS:
+            keys[topic.name, part].append(payload)
+    return dict(keys)
+
+
+def undisturbed(run: str) -> dict:
+    keys = defaultdict(list)
+    run_local(pairs(configuration(EPISODES, STEPS)), PARTS, run, None,
+              lambda t, p, m, payload: keys[t.name, p].append(payload), encoded=True)
+    return dict(keys)
+
+
+def assert_as_if_nothing_had_happened(run_dir: Path, results: list) -> None:
+    assert [r.episode for r in results] == list(range(EPISODES))
+    report = missing(run_dir / "run.mcap")
+    assert report.complete, report
+    assert logged(run_dir / "run.mcap") == undisturbed(run_dir.name)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_service_killed_at_any_moment_goes_on_where_it_was(tmp_path, name):
+    """Three random moments, one of them maybe between two episodes; what is said names the service each time."""
+    rng, run_dir = random.Random(f"moments of {name}"), tmp_path / "run"
+    moments = [(episode, rng.randrange(STEPS)) for episode in range(EPISODES)]
+
+    def kill() -> None:
+        time.sleep(rng.random() * 0.02)
+        if (process := process_of(run_dir, name)) is not None:
+            os.kill(process, signal.SIGKILL)
+
+    results, said = disturbed(run_dir, dict.fromkeys(moments, kill))
+    assert_as_if_nothing_had_happened(run_dir, results)
+    assert [text for text in said if text.startswith(f"{name} is started again: ")]
