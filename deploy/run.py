@@ -11,6 +11,7 @@ from rich.console import Console
 from deploy.display import Display, Progress, spread_cm
 from deploy.launch import CONFIG_NAME, launch
 from deploy.registry import agent_of, agent_processes, local_pairs
+from services.camera.sources import absolute
 from services.recorder.core import LOG_NAME, describe
 from services.simulator.core import names_in_use
 from shared.config import Config
@@ -48,8 +49,9 @@ def resolve(config: Config) -> Config:
     """The configuration with its objects named and its paths absolute."""
     scene = config.scene
     paths = {"scene.file": scene.file, "scene.goal_image": scene.goal_image,
-             "perception.weights": config.perception.weights}
-    return config.with_values({"scene.names": list(names_in_use(scene))} |
+             "camera.poses": config.camera.poses, "perception.weights": config.perception.weights}
+    source = {} if config.camera.source is None else {"camera.source": absolute(config.camera.source)}
+    return config.with_values({"scene.names": list(names_in_use(scene))} | source |
                               {key: path.resolve() for key, path in paths.items() if path is not None})
 
 
