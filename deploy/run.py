@@ -12,6 +12,7 @@ from deploy.display import Display, Progress, spread_cm
 from deploy.launch import launch
 from deploy.registry import agent_of, agent_processes, local_pairs
 from deploy.supervisor import CONFIG_NAME
+from services.camera.sources import absolute
 from services.recorder.core import LOG_NAME, describe
 from services.simulator.core import names_in_use
 from shared.config import Config
@@ -49,8 +50,9 @@ def resolve(config: Config) -> Config:
     """The configuration with its objects named and its paths absolute."""
     scene = config.scene
     paths = {"scene.file": scene.file, "scene.goal_image": scene.goal_image,
-             "perception.weights": config.perception.weights}
-    return config.with_values({"scene.names": list(names_in_use(scene))} |
+             "camera.poses": config.camera.poses, "perception.weights": config.perception.weights}
+    source = {} if config.camera.source is None else {"camera.source": absolute(config.camera.source)}
+    return config.with_values({"scene.names": list(names_in_use(scene))} | source |
                               {key: path.resolve() for key, path in paths.items() if path is not None})
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 import tomllib
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
 from shared.errors import SaccadeError
 
@@ -20,6 +20,7 @@ class Section(BaseModel):
 
 
 Checked = TypeVar("Checked", bound=Section)
+Focal = Annotated[FiniteFloat, Field(gt=0)]
 
 
 class BusConfig(Section):
@@ -53,6 +54,17 @@ class SimulatorConfig(Section):
     max_steps: int = Field(350, ge=1)
     until: Literal["reached", "declared"] = "reached"  # the paper's any-time success, or the agent's own word
     publish_depth: bool = False  # no agent of ours needs it
+
+
+class CameraConfig(Section):
+    """Real images in the simulator's place; what is absent is assumed, and the camera says so."""
+
+    source: str | None = None  # a folder of images, a video file, or a webcam: webcam:0
+    poses: Path | None = None  # JSON lines or TUM
+    pose_convention: Literal["opengl", "opencv"] | None = None  # JSON lines are OpenGL, TUM is OpenCV where absent
+    intrinsics_px: tuple[Focal, Focal, FiniteFloat, FiniteFloat] | None = None  # fx, fy, cx, cy of the source's images
+    rate_hz: float = Field(10.0, gt=0, le=1000)  # of a folder and of a webcam; a video has its own
+    loop: bool = False
 
 
 class PerceptionConfig(Section):
@@ -101,6 +113,7 @@ class Config(Section):
     bus: BusConfig = BusConfig()
     scene: SceneConfig = SceneConfig()
     simulator: SimulatorConfig = SimulatorConfig()
+    camera: CameraConfig = CameraConfig()
     perception: PerceptionConfig = PerceptionConfig()
     belief: BeliefConfig = BeliefConfig()
     planner: PlannerConfig = PlannerConfig()

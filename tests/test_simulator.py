@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from services.simulator.core import SERVICE, Simulator, build, names_in_use, read_goal_image, scenes_of
+from services.simulator.core import SERVICE, Simulator, build, names_in_use, scenes_of
 from services.simulator.objects import load_mesh
 from services.simulator.scenes import generate_scene, save_scenes
 from services.simulator.world import World
 from shared.config import Config
 from shared.errors import SaccadeError
 from shared.geometry import look_at
+from shared.images import read_goal_image
 from shared.messages import Action, decode, encode
 from shared.task import start_pose
 

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
 
 from services.simulator.objects import load_mesh, names_of
 from services.simulator.scenes import Placed, Scene, Sizes, generate_scene, load_scenes
 from services.simulator.world import World
 from shared.config import Config, SceneConfig
 from shared.errors import SaccadeError
-from shared.geometry import IMAGE_SIZE_PX
+from shared.images import read_goal_image
 from shared.messages import Frame, Goal, Truth
 from shared.seeding import generator
 from shared.service import Inputs, Output, Service
@@ -101,22 +99,6 @@ class Simulator:
                      target_center_m=scene.target_placed.center_m, world_from_camera=state.camera,
                      goal_world_from_camera=state.goal, success=state.reached, done=state.done,
                      declared=state.declared, declared_true=state.declared_true)
-
-
-def read_goal_image(path: Path) -> NDArray[np.uint8]:
-    """The user's goal image [480, 480, 3]. Raises SaccadeError unless it is a whole PNG or JPEG in RGB of that size."""
-    need = f"give a PNG or JPEG of {IMAGE_SIZE_PX}x{IMAGE_SIZE_PX} pixels in RGB"
-    try:
-        with Image.open(path, formats=("PNG", "JPEG")) as image:
-            if image.size != (IMAGE_SIZE_PX, IMAGE_SIZE_PX):
-                raise SaccadeError(f"goal image {path} is {image.size[0]}x{image.size[1]} pixels: {need}")
-            if image.mode != "RGB":
-                raise SaccadeError(f"goal image {path} has mode {image.mode}, not RGB: {need}")
-            return np.array(image)
-    except UnidentifiedImageError as error:
-        raise SaccadeError(f"goal image {path} is neither PNG nor JPEG: {need}") from error
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:  # a damaged PNG: SyntaxError
-        raise SaccadeError(f"goal image {path} cannot be read ({error}): {need}") from error
 
 
 def names_in_use(config: SceneConfig) -> tuple[str, ...]:

@@ -1,0 +1,251 @@
+"""Where real images come from: a folder, a video file or a webcam, each image with its index and time."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import queue
+import re
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.errors import SaccadeError
+from shared.images import Size, image_size, read_image
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
+DEFAULT_RATE_HZ = 10.0
+MAX_RATE_HZ = 1000.0  # beyond it a video's header says nothing
+WHOLE = 0.9  # share of the frames announced; some formats only estimate their number
+RELEASE_S = 1.0  # a webcam's thread is waited for so long
+
+
+@dataclass(frozen=True)
+class SourceImage:
+    """RGB [H, W, 3], its number from 0, its time in seconds since the source began, its file's name ("" if none)."""
+
+    rgb: NDArray[np.uint8]
+    index: int
+    time_s: float
+    name: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.name or f'image {self.index}'} at {self.time_s:.3f} s"
+
+
+class Source(Protocol):
+    """Images in order; iterating again begins anew. All images have one size."""
+
+    name: str
+    size_px: Size
+    period_s: float  # from one image to the next
+    endless: bool
+
+    def __iter__(self) -> Iterator[SourceImage]:
+        """The images. Raises SaccadeError for one that cannot be read."""
+
+
+def open_source(text: str, *, rate_hz: float = DEFAULT_RATE_HZ) -> Source:
+    """A folder of PNG or JPEG images, a video file, or a webcam (`webcam:0`, `/dev/video0`).
+
+    `rate_hz`: images a second of a folder and of a webcam; a video has its own. Raises SaccadeError for what is not
+    there or cannot be read.
+    """
+    number = webcam_number(text)
+    if number is not None:
+        return Webcam(number, rate_hz)
+    path = Path(text)
+    if path.is_dir():
+        return Folder(path, rate_hz)
+    need = "give a folder of images, a video file, or a webcam such as webcam:0"
+    if not path.is_file():
+        raise SaccadeError(f"camera source {text} is not there: {need}")
+    if path.suffix.lower() in IMAGE_SUFFIXES:
+        raise SaccadeError(f"camera source {text} is a single image: give the folder that it is in")
+    return Video(path, rate_hz)
+
+
+def webcam_number(text: str) -> int | None:
+    """0 of `webcam:0` and of `/dev/video0`; None of any other text."""
+    match = re.fullmatch(r"(?:webcam:|/dev/video)([0-9]+)", text)
+    return int(match[1]) if match else None
+
+
+def absolute(text: str) -> str:
+    """The source's text, meaning the same in every working directory."""
+    return text if webcam_number(text) is not None else str(Path(text).resolve())
+
+
+class Folder:
+    """The PNG and JPEG files of a folder, sorted by name with numbers in their order; hidden files are not seen."""
+
+    endless = False
+
+    def __init__(self, path: Path, rate_hz: float = DEFAULT_RATE_HZ):
+        self.name, self.period_s = str(path), 1.0 / rate_hz
+        try:
+            found = [p for p in path.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".")]
+        except OSError as error:
+            raise SaccadeError(f"folder {path} cannot be read: {error.strerror}") from error
+        self.paths = sorted(found, key=_natural)
+        if not self.paths:
+            raise SaccadeError(f"folder {path} holds no image: put PNG or JPEG files into it")
+        self.size_px = _common_size(self.paths)
+
+    def __iter__(self) -> Iterator[SourceImage]:
+        for index, path in enumerate(self.paths):
+            yield SourceImage(read_image(path), index, index * self.period_s, path.name)
+
+
+def _natural(path: Path) -> tuple[list[str | int], str]:
+    parts = re.split(r"(\d+)", path.name)  # text and digits by turns
+    return [int(part) if k % 2 else part.casefold() for k, part in enumerate(parts)], path.name
+
+
+def _common_size(paths: list[Path]) -> Size:
+    """The size of all images. One camera has one size: where sizes differ no intrinsics hold for all."""
+    first, *others = paths
+    size = image_size(first)
+    for path in others:
+        other = image_size(path)
+        if other != size:
+            raise SaccadeError(f"image {path} is {other[0]}x{other[1]} pixels, {first.name} is {size[0]}x{size[1]}: "
+                               "the images of a folder must come from one camera, upright or on its side alike")
+    return size
+
+
+class Video:
+    """A video file; times are those of its frames, counted with its frame rate where they have none."""
+
+    endless = False
+
+    def __init__(self, path: Path, rate_hz: float = DEFAULT_RATE_HZ):
+        self.name = str(path)
+        self._path = path
+        capture, first = self._begin()
+        fps = capture.get(_cv2().CAP_PROP_FPS)
+        self._announced = capture.get(_cv2().CAP_PROP_FRAME_COUNT)
+        capture.release()
+        self.period_s = 1.0 / (fps if 0 < fps <= MAX_RATE_HZ else rate_hz)
+        self.size_px = _size(first)
+
+    def _begin(self) -> tuple[Any, NDArray[np.uint8]]:
+        capture = _capture(self.name)
+        read, bgr = capture.read()
+        if not read:
+            capture.release()
+            raise SaccadeError(f"video {self._path} cannot be read: it is damaged, empty, or of a format unknown to "
+                               "OpenCV; give another, or a folder of its images")
+        return capture, bgr
+
+    def __iter__(self) -> Iterator[SourceImage]:
+        capture, bgr = self._begin()
+        try:
+            time_s = -np.inf
+            for index in itertools.count():
+                stamp = capture.get(_cv2().CAP_PROP_POS_MSEC) / 1e3
+                time_s = stamp if stamp > time_s else time_s + self.period_s
+                yield SourceImage(_rgb(bgr), index, float(time_s))
+                read, bgr = capture.read()
+                if not read:
+                    break
+        finally:
+            capture.release()
+        if index + 1 < WHOLE * self._announced:
+            raise SaccadeError(f"video {self._path} breaks off after {index + 1} of {self._announced:.0f} frames: cut "
+                               "off what is damaged")
+
+
+class Webcam:
+    """A camera of this machine: always its newest image, with the time since the first by `clock` (seconds)."""
+
+    endless = True
+
+    def __init__(self, number: int, rate_hz: float = DEFAULT_RATE_HZ, clock: Callable[[], float] = time.monotonic):
+        self.name, self.period_s = f"webcam:{number}", 1.0 / rate_hz
+        self._number, self._clock = number, clock
+        capture = self._open()
+        read, bgr = capture.read()
+        capture.release()
+        if not read:
+            raise self._silent()
+        self.size_px = _size(bgr)
+
+    def _open(self) -> Any:
+        capture = _capture(self._number)
+        if not capture.isOpened():
+            raise SaccadeError(f"{self.name} does not open: is it connected, permitted, and used by no other program?")
+        return capture
+
+    def _silent(self) -> SaccadeError:
+        return SaccadeError(f"{self.name} gives no image: is it connected, and used by no other program?")
+
+    def __iter__(self) -> Iterator[SourceImage]:
+        newest: queue.Queue = queue.Queue(maxsize=1)
+        stop = threading.Event()
+        thread = threading.Thread(target=_keep_newest, args=(self._open(), self._clock, newest, stop), daemon=True)
+        thread.start()
+        try:
+            start = None
+            for index in itertools.count():
+                item = newest.get()
+                if item is None:
+                    raise self._silent()
+                at, bgr = item
+                start = at if start is None else start
+                yield SourceImage(_rgb(bgr), index, at - start)
+        finally:
+            stop.set()
+            thread.join(RELEASE_S)
+
+
+def _keep_newest(capture: Any, clock: Callable[[], float], newest: queue.Queue, stop: threading.Event) -> None:
+    """Drivers queue images: read as they come, or a slow consumer is shown the past. None says that no more come."""
+
+    def put(item: tuple[float, NDArray[np.uint8]] | None) -> None:
+        with suppress(queue.Empty):
+            newest.get_nowait()
+        newest.put(item)
+
+    try:
+        while not stop.is_set():
+            read, bgr = capture.read()
+            if not read:
+                break
+            put((clock(), bgr))
+    finally:
+        put(None)
+        capture.release()
+
+
+def _cv2() -> Any:
+    """OpenCV, loaded when the first video or webcam is opened. Raises SaccadeError where it is not installed."""
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # quiet: what fails is said in one line of ours
+    try:
+        import cv2
+    except ImportError as error:
+        raise SaccadeError(f"videos and webcams need OpenCV ({error}): pip install opencv-python-headless, or give a "
+                           "folder of images") from error
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    cv2.setNumThreads(1)  # like every service
+    return cv2
+
+
+def _capture(what: str | int) -> Any:
+    cv2 = _cv2()
+    return cv2.VideoCapture(what, cv2.CAP_FFMPEG if isinstance(what, str) else cv2.CAP_ANY)
+
+
+def _rgb(bgr: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    return np.ascontiguousarray(bgr[..., ::-1])
+
+
+def _size(bgr: NDArray[np.uint8]) -> Size:
+    return bgr.shape[1], bgr.shape[0]

@@ -1,0 +1,91 @@
+"""The camera that the networks were trained with, put in the place of the real one.
+
+scale = 0.40 m / range is learned at the training's focal length, so another camera's images would give wrong ranges.
+Two pinhole cameras with one centre see the same rays: their images differ by a homography, K' K^-1, whatever the scene.
+With equal attitude and no skew that is a scale and a shift of each axis.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from shared.errors import SaccadeError
+from shared.geometry import IMAGE_SIZE_PX, INTRINSICS_PX
+from shared.images import Size
+
+Intrinsics = tuple[float, float, float, float]  # fx, fy, cx, cy in pixels
+
+MIN_COVERAGE = 0.2  # of the networks' field of view; below it most of what they see would be made up
+CENTRAL = (0.3, 0.7)  # where a principal point lies, as a share of the image's side
+FILL = 128  # grey: the image's edge, drawn out, makes objects there larger and others appear
+_ROUNDING_PX = 1e-6
+
+
+@dataclass(frozen=True)
+class _Axis:
+    """Output pixels [first, last) of one axis show the image from `start` to `end` (pixels of the image)."""
+
+    first: int
+    last: int
+    start: float
+    end: float
+
+
+def _axis(length_px: int, focal: float, center: float, trained_focal: float, trained_center: float) -> _Axis:
+    step = focal / trained_focal
+    origin = center - trained_center * step  # of the output, in pixels of the image
+    first = max(0, int(np.ceil(-origin / step - _ROUNDING_PX)))
+    last = min(IMAGE_SIZE_PX, int(np.floor((length_px - origin) / step + _ROUNDING_PX)))
+    return _Axis(first, last, max(0.0, origin + first * step), min(float(length_px), origin + last * step))
+
+
+def assumed_intrinsics(size_px: Size) -> Intrinsics:
+    """Those of images of this size whose central square, at 480x480 pixels, has the intrinsics of the training."""
+    side = min(size_px)
+    fx, fy, cx, cy = (x * side / IMAGE_SIZE_PX for x in INTRINSICS_PX)
+    return fx, fy, cx + (size_px[0] - side) / 2, cy + (size_px[1] - side) / 2
+
+
+class VirtualCamera:
+    """Turns images of `size_px` into those that a camera with INTRINSICS_PX would see from the same pose.
+
+    `intrinsics_px` (fx, fy, cx, cy) are the real camera's, without lens distortion; cx, cy from the corner of the first
+    pixel (OpenCV counts from its centre: half a pixel less). Absent, those of `assumed_intrinsics`, which makes it a
+    central square crop. What the real camera does not see is grey; `coverage` is the share of the output that it does
+    see. Raises SaccadeError for intrinsics that cannot be those of images of this size.
+    """
+
+    def __init__(self, size_px: Size, intrinsics_px: Sequence[float] | None = None):
+        self.size_px = size_px
+        fx, fy, cx, cy = assumed_intrinsics(size_px) if intrinsics_px is None else intrinsics_px
+        name = f"intrinsics ({fx:g}, {fy:g}, {cx:g}, {cy:g}) px"
+        need = "give fx, fy, cx, cy of images of this size"
+        if not (np.isfinite([fx, fy, cx, cy]).all() and min(fx, fy) > 0):
+            raise SaccadeError(f"{name}: not finite, or a focal length that is not positive: {need}")
+        width, height = size_px
+        if not all(CENTRAL[0] <= share <= CENTRAL[1] for share in (cx / width, cy / height)):
+            raise SaccadeError(f"{name}: the principal point is not near the centre of {width}x{height} pixels: {need}")
+        trained_fx, trained_fy, trained_cx, trained_cy = INTRINSICS_PX
+        self._u = _axis(width, fx, cx, trained_fx, trained_cx)
+        self._v = _axis(height, fy, cy, trained_fy, trained_cy)
+        self.coverage = (self._u.last - self._u.first) * (self._v.last - self._v.first) / IMAGE_SIZE_PX ** 2
+        if self.coverage < MIN_COVERAGE:
+            raise SaccadeError(f"{name}: images of {width}x{height} pixels would cover {self.coverage:.0%} of the "
+                               f"networks' field of view, less than {MIN_COVERAGE:.0%}: {need}, or use a wider lens")
+
+    def see(self, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The image [480, 480, 3] with INTRINSICS_PX. Raises SaccadeError where `rgb` [H, W, 3] has another size."""
+        if rgb.shape != (*self.size_px[::-1], 3):
+            raise SaccadeError(f"an image of shape {list(rgb.shape)} among images of {self.size_px[0]}x"
+                               f"{self.size_px[1]} pixels: all must come from one camera")
+        u, v = self._u, self._v
+        seen = Image.fromarray(rgb).resize((u.last - u.first, v.last - v.first), Image.Resampling.BILINEAR,
+                                           box=(u.start, v.start, u.end, v.end))
+        result = np.full((IMAGE_SIZE_PX, IMAGE_SIZE_PX, 3), FILL, dtype=np.uint8)
+        result[v.first:v.last, u.first:u.last] = seen
+        return result

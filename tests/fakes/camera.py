@@ -1,0 +1,61 @@
+"""Folders of images, pose files and what a refusal says: for the tests of the camera."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from shared.errors import SaccadeError
+from shared.geometry import look_at
+
+HERE = look_at([0.4, 0.1, 0.3], [0.0, 0.0, 0.05])
+THERE = look_at([0.2, 0.4, 0.5], [0.0, 0.0, 0.05])
+
+
+def folder_of(folder, names, size=(64, 48)):
+    """Images whose every pixel is their number, in the order of `names`."""
+    folder.mkdir(exist_ok=True)
+    for k, name in enumerate(names):
+        Image.new("RGB", size, (k, k, k)).save(folder / name)
+    return folder
+
+
+def line(world_from_camera=HERE, **key):
+    return json.dumps({**key, "world_from_camera": np.asarray(world_from_camera).tolist()})
+
+
+def tum(time_s, world_from_camera):
+    numbers = [*world_from_camera[:3, 3], *Rotation.from_matrix(world_from_camera[:3, :3]).as_quat()]
+    return " ".join(f"{x:.9f}" for x in (time_s, *numbers))
+
+
+def written(path, *lines):
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def complaint(make, *arguments, **more):
+    with pytest.raises(SaccadeError) as caught:
+        make(*arguments, **more)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def dots(pixels, size):
+    """White squares of 7x7 pixels, smooth to a part of a pixel, at `pixels` on black."""
+    u, v = np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5
+    image = np.zeros((size[1], size[0]))
+    for x, y in pixels:
+        image += np.clip(4 - np.abs(u - x), 0, 1) * np.clip(4 - np.abs(v - y), 0, 1)[:, None]
+    return np.repeat((255 * image).round().astype(np.uint8)[..., None], 3, axis=2)
+
+
+def centroid(image, near):
+    """The centre of the light within 16 pixels of a pixel."""
+    u, v = np.meshgrid(np.arange(480) + 0.5, np.arange(480) + 0.5)
+    light = image[..., 0] * ((np.abs(u - near[0]) < 16) & (np.abs(v - near[1]) < 16))
+    return np.array([(u * light).sum(), (v * light).sum()]) / light.sum()
