@@ -1,0 +1,1 @@
+"""Logs of runs, for tools that do not know Saccade's messages."""
