@@ -2,7 +2,7 @@
 PYTHON ?= python3
 SACCADE = .venv/bin/saccade
 
-.PHONY: run test lint bench clean
+.PHONY: run test lint bench fixtures clean
 
 run: .venv/.installed
 	$(SACCADE) run
@@ -13,6 +13,9 @@ test: .venv/.installed-dev lint
 lint: .venv/.installed-dev
 	.venv/bin/ruff check .
 	.venv/bin/lint-imports
+
+fixtures: .venv/.installed-dev
+	.venv/bin/python -m tests.fixtures.make
 
 bench: .venv/.installed
 	$(SACCADE) bench --objects pantry --jobs 2 --json bench/pantry.json

@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 from deploy.supervisor import CONFIG_NAME, LOGS_NAME, Process, Supervisor
@@ -41,8 +42,32 @@ def launch(config: Config, run_dir: Path, on_message: OnMessage | None = None,
     source. Raises SaccadeError, naming the service, if one says why it cannot run, dies too often or is not ready
     within READY_S.
     """
-    _prepare(run_dir)
     config = resolve(config, processes)
+    with running(config, run_dir, processes, None if on_message else (STATUS, RESULT), say) as graph:
+        results = _follow(graph, processes, on_message)
+        graph.supervisor.stop()
+        _drain(graph.messages, on_message)
+        for complaint in graph.supervisor.complaints():  # what went wrong beside the results, such as a full disk
+            print(f"saccade: {complaint}", file=sys.stderr)
+    return results
+
+
+@dataclass(frozen=True)
+class Graph:
+    """Processes that run, and a place on their bus. `messages`: (topic, part, message) as they arrive, each once, and
+    None when nothing did; iterating watches over the processes."""
+
+    bus: Bus
+    supervisor: Supervisor
+    messages: Iterator[tuple[Topic, str | None, Message] | None]
+
+
+@contextmanager
+def running(config: Config, run_dir: Path, processes: Sequence[Process], topics: Sequence[Topic] | None,
+            say: Callable[[str], None] | None = None) -> Iterator[Graph]:
+    """The processes of a resolved configuration in a new run folder, ended when the context is left. The first is the
+    router, and is there before the others. `topics`: which messages are wanted, None for all."""
+    _prepare(run_dir)
     config.save(run_dir / CONFIG_NAME)
     arrived: queue.SimpleQueue = queue.SimpleQueue()
     with ExitStack() as stack:
@@ -52,17 +77,12 @@ def launch(config: Config, run_dir: Path, on_message: OnMessage | None = None,
         supervisor.start(processes[0])
         bus = ZenohBus(config.bus.endpoint, world=config.bus.world)
         stack.callback(bus.close)
-        bus.subscribe(None if on_message else (STATUS, RESULT), lambda *item: arrived.put(item))
-        messages = _messages(arrived, bus, supervisor, run_dir.name)
+        bus.subscribe(topics, lambda *item: arrived.put(item))
+        messages = _messages(arrived, bus, supervisor, config.run or run_dir.name)
         _await_router(messages, processes[0])
         for process in processes[1:]:
             supervisor.start(process)
-        results = _follow(messages, processes, on_message, supervisor)
-        supervisor.stop()
-        _drain(messages, on_message)
-        for complaint in supervisor.complaints():  # what went wrong beside the results (a full disk under the log)
-            print(f"saccade: {complaint}", file=sys.stderr)
-    return results
+        yield Graph(bus, supervisor, messages)
 
 
 def resolve(config: Config, processes: Sequence[Process] = PROCESSES) -> Config:
@@ -114,15 +134,14 @@ def _await_router(messages: Iterator, router: Process) -> None:
             raise SaccadeError(f"{router.name}: not ready after {READY_S:.0f} s; see {LOGS_NAME}/")
 
 
-def _follow(messages: Iterator, processes: Sequence[Process], on_message: OnMessage | None,
-            supervisor: Supervisor) -> list[Result]:
+def _follow(graph: Graph, processes: Sequence[Process], on_message: OnMessage | None) -> list[Result]:
     results: dict[int, Result] = {}
     starting = {process.name for process in processes[1:]}
     episodes, deadline_s = None, time.monotonic() + READY_S
-    for item in messages:
+    for item in graph.messages:
         if starting and time.monotonic() > deadline_s:
             raise SaccadeError(f"{', '.join(sorted(starting))}: not ready after {READY_S:.0f} s; see {LOGS_NAME}/")
-        if episodes is not None and len(results) >= episodes and supervisor.settled:
+        if episodes is not None and len(results) >= episodes and graph.supervisor.settled:
             break
         if item is None:
             continue

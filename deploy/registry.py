@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
 
@@ -80,6 +81,17 @@ def weight_hashes(agent: str, config: Config) -> dict[str, str]:
     weights = Weights(config.weights)
     weights.cards_of(config.scene.names or ())
     return dict(sorted(weights.hashes.items()))
+
+
+def service_of(name: str) -> Service:
+    """The declaration of a service of ours."""
+    return import_module(f"services.{name}.core").SERVICE
+
+
+def pairs_of(names: Sequence[str], config: Config) -> list[Pair]:
+    """Declarations and cores of services of ours, built for a configuration whose objects are named."""
+    limit_torch()
+    return [_pair(f"services.{name}.core", config) for name in names]
 
 
 def _pair(module_name: str, config: Config) -> Pair:

@@ -107,8 +107,9 @@ class PlannerConfig(Section):
 
 
 class Config(Section):
-    """A run."""
+    """A run. `run` is its name; where absent, that of its folder."""
 
+    run: str | None = None
     seed: int = Field(0, ge=0)
     bus: BusConfig = BusConfig()
     scene: SceneConfig = SceneConfig()

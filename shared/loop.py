@@ -38,8 +38,8 @@ def main(service: Service, build: Callable[[Config], Core], *, source: bool = Fa
         core = build(config)
         bus = ZenohBus(config.bus.endpoint, world=config.bus.world)
         try:
-            serve(service, core, bus, names, run=folder.name, source=source, wait_for=config.bus.wait_for, inbox=inbox,
-                  live=config.bus.live, first_step=config.bus.first_step)
+            serve(service, core, bus, names, run=config.run or folder.name, source=source,
+                  wait_for=config.bus.wait_for, inbox=inbox, live=config.bus.live, first_step=config.bus.first_step)
         finally:
             bus.close()
 

@@ -56,7 +56,7 @@ class Recorder:
     for; what they said twice is written once. A log of this run that is there already is gone on with."""
 
     def __init__(self, bus: Bus, folder: Path, config: Config) -> None:
-        self.health, self._bus, self._run = Health(NAME), bus, folder.name
+        self.health, self._bus, self._run = Health(NAME), bus, config.run or folder.name
         self._sequences = Sequences(from_start=True)
         self._last: dict[tuple[str, str | None], tuple[int, int]] = {}  # of each key: episode and step
         self._asked_s, self._ask_again_s = 0.0, ASKED_AGAIN_S
@@ -112,8 +112,8 @@ class Recorder:
         self.health.received += 1
         try:
             message = decode(topic.type, payload)
-            if self._sequences.begins(topic, part, message):  # how the episode before it ended may have been lost
-                self._write_kept([topic], self._last[topic.name, part])
+            if message.run == self._run and self._sequences.begins(topic, part, message):
+                self._write_kept([topic], self._last[topic.name, part])  # how the last episode ended may be lost
         except MessageError as error:  # recorded all the same: the log is what was on the wire
             self.health.refuse(topic, part, error)
         self._write(self.log, topic, part, payload)
@@ -158,7 +158,8 @@ class Recorder:
 def describe(config: Config, run: str) -> dict[str, dict[str, str]]:
     """What the log says about its origin: configuration hash, seed, versions, weights' hashes."""
     text = config.model_dump_json()
-    return {"run": {"run": run, "seed": str(config.seed), "commit": commit(),
+    cut = {"cut": {"start": str(config.bus.first_step)}} if config.bus.first_step else {}
+    return {**cut, "run": {"run": run, "seed": str(config.seed), "commit": commit(),
                     "configuration_sha256": hashlib.sha256(text.encode()).hexdigest()},
             "versions": {"python": platform.python_version(), **{name: _version(name) for name in PACKAGES}},
             "weights_sha256": {str(p.relative_to(config.weights)): hashlib.sha256(p.read_bytes()).hexdigest()

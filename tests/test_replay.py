@@ -1,0 +1,170 @@
+"""Recorded inputs give again what was recorded, to the byte; where they do not, it is said which field, where, by how
+much."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deploy.comparison import Comparison, differences
+from deploy.logs.check import missing
+from deploy.replay import REPLAYABLE
+from deploy.tolerances import TOLERANCES, tolerance_of
+from shared.messages import encode, field_types
+from shared.reading import RunReader
+from shared.recording import RunLog
+from shared.topics import ACTION, BELIEF, FRAME, PERCEPT, STATUS, TOPICS
+from tests.fixtures.make import GOLDEN, IN_WORDS, WORDS, changes, in_words
+from tests.samples import sample
+
+FORMAT_1 = GOLDEN.with_name("format_1.mcap")
+WAIT_S = 300
+
+
+def saccade(*arguments: str | Path, keys: str = "") -> subprocess.CompletedProcess:
+    """`saccade replay` as a user gives it, with these key presses."""
+    return subprocess.run([sys.executable, "-m", "deploy.cli", "replay", *map(str, arguments)], capture_output=True,
+                          text=True, input=keys, timeout=WAIT_S, env=os.environ | {"COLUMNS": "200"})
+
+
+def messages(log: Path, *topics) -> list:
+    return [(t.name, p, encode(m)) for t, p, m in RunReader(log) if t in topics]
+
+
+@pytest.mark.parametrize("name", ["perception", "belief", "planner"])
+def test_each_service_says_again_what_the_golden_log_holds(tmp_path, name):
+    """A changed result fails here and names the field. If it is meant: `make fixtures`, and look at golden.txt."""
+    done = saccade(GOLDEN, "--into", name, "--check", "--bus", "local", "--out", tmp_path / "replay")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "0 beyond what is tolerated" in done.stdout
+    assert "; 0 answers" not in done.stdout
+
+
+def test_the_golden_log_in_words_is_that_of_the_log():
+    assert WORDS.read_text().splitlines() == in_words(GOLDEN)
+    assert changes(GOLDEN, GOLDEN) == ["nothing changed"]
+
+
+def test_the_oldest_format_still_replays_to_the_byte(tmp_path):
+    """Also its sequence numbers, which ran through all episodes then. Its weights are those of today: when they change,
+    this compares no more, but must still run."""
+    reader = RunReader(FORMAT_1)
+    first = {(t.name, p, m.episode): m.seq for t, p, m in reversed(list(reader)) if t.in_step}
+    assert reader.format == 1
+    assert set(first.values()) == {0}
+    done = saccade(FORMAT_1, "--into", "perception,belief,planner", "--bus", "local", "--out", tmp_path / "replay")
+    assert done.returncode == 0, done.stderr
+    assert missing(tmp_path / "replay" / "run.mcap").complete
+    again = {(name, p) for name, p, _ in messages(tmp_path / "replay" / "run.mcap", *IN_WORDS)}
+    assert again == {(name, p) for name, p, _ in messages(FORMAT_1, *IN_WORDS)}
+
+
+def test_on_the_bus_as_in_one_process_nothing_is_lost(tmp_path):
+    done = saccade(GOLDEN, "--into", ",".join(REPLAYABLE), "--check", "--out", tmp_path / "replay")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "0 differ in a byte" in done.stdout
+    assert "loss: 0 of" in done.stdout
+    topics = [topic for topic in TOPICS.values() if topic != STATUS]
+    assert sorted(messages(tmp_path / "replay" / "run.mcap", *topics)) == sorted(messages(GOLDEN, *topics))
+
+
+def test_a_swapped_service_is_held_against_the_old_log(tmp_path):
+    out = tmp_path / "replay"
+    done = saccade(GOLDEN, "--into", "perception,belief,planner", "--check", "--bus", "local", "--out", out, "--set",
+                   "perception.passes=1")
+    assert done.returncode == 1
+    assert "percept/soup_can episode 0 step 0: pixel: recorded [" in done.stdout
+    table = (out / "moved.txt").read_text()
+    assert all(what in table for what in ("pixel (px)", "position (cm)", "goal view (rad)", "viewpoint (cm)", "move (cm)"))
+    assert (out / "moved.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_part_of_a_log(tmp_path):
+    """Perception needs no past: its answers from step 2 on are those of the recording."""
+    done = saccade(GOLDEN, "--into", "perception", "--check", "--bus", "local", "--start", "2", "--end", "2", "--out",
+                   tmp_path / "replay")
+    played = [m.step for t, _, m in RunReader(tmp_path / "replay" / "run.mcap") if t == FRAME]
+    assert played == [2]
+    assert "percept" not in "".join(line for line in done.stdout.splitlines() if "only" in line and "goal" not in line)
+
+
+def test_key_presses_give_one_message_each(tmp_path):
+    done = saccade(GOLDEN, "--into", "perception", "--bus", "local", "--step", "--out", tmp_path / "a", keys="  q")
+    assert "2 messages played" in done.stdout
+    done = saccade(GOLDEN, "--into", "perception", "--bus", "local", "--rate", "1", "--out", tmp_path / "b", keys=" q")
+    assert "paused" in done.stdout
+    assert "0 messages played" in done.stdout
+
+
+def test_two_logs_at_once_and_more_than_once(tmp_path):
+    done = saccade(GOLDEN, GOLDEN, "--into", "planner", "--check", "--bus", "local", "--loop", "2", "--out",
+                   tmp_path / "replay")
+    assert done.returncode == 0, done.stderr
+    logs = sorted((tmp_path / "replay").rglob("run.mcap"))
+    assert len(logs) == 4
+    assert len({tuple(messages(log, ACTION)) for log in logs}) == 1
+
+
+@pytest.mark.parametrize(("arguments", "reason"), [
+    (["--into", "simulator"], "--into simulator: choose from perception, belief, planner, evaluator"),
+    (["--into", "belief", "--rate", "0"], "--rate 0: give a number from 0.1 to 100, or max"),
+    (["--into", "belief", "--start", "x"], "--start and --end: give two steps such as 3, or two times such as 2.5s"),
+    (["--into", "belief", "--start", "500s"], "the time asked for is empty"),
+    (["--into", "belief", "--topics", "frames"], "--topics frames: choose from frame"),
+    (["--into", "belief", "--perception", "nowhere"], "--perception nowhere: "),
+    (["--into", "belief", "--set", "belief.colour=1"], "configuration key 'belief.colour' is unknown"),
+])
+def test_what_makes_no_sense_is_one_line(tmp_path, arguments, reason):
+    done = saccade(GOLDEN, *arguments, "--bus", "local", "--out", tmp_path / "replay")
+    assert done.returncode == 2
+    assert done.stderr.startswith("saccade: ")
+    assert done.stderr.count("\n") == 1
+    assert reason in done.stderr
+    assert not (tmp_path / "replay").exists()
+
+
+def test_a_log_without_messages_or_configuration_is_one_line(tmp_path):
+    RunLog(tmp_path / "empty.mcap", world="test").close()
+    done = saccade(tmp_path / "empty.mcap", "--into", "belief", "--out", tmp_path / "replay")
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert "holds no messages: nothing to replay" in done.stderr
+
+
+def test_differences_name_the_field_the_place_and_both_values():
+    old = sample(PERCEPT.type, object="mug", episode=1, step=7)
+    pixel = old.pixel + np.array([0.0, 3.0])
+    new = dataclasses.replace(old, pixel=pixel, presence=0.25, latent_std=old.latent_std + np.float32(1e-4))
+    told = {d.field: d for d in differences(PERCEPT, "mug", old, new)}
+    assert set(told) == {"pixel", "presence", "latent_std"}
+    assert str(told["pixel"]) == "percept/mug episode 1 step 7: pixel: recorded [1] 1, replayed [1] 4"
+    assert (told["pixel"].size, told["presence"].size) == (3.0, 0.25)
+    assert [told[name].tolerated for name in ("pixel", "presence", "latent_std")] == [False, False, True]
+
+
+def test_a_comparison_waits_for_both_and_tells_what_is_alone():
+    comparison, action = Comparison(), sample(ACTION.type, step=1)
+    later = sample(ACTION.type, step=2)
+    comparison.replayed(ACTION, None, action, encode(action))
+    comparison.recorded(ACTION, None, later, encode(later))
+    assert not comparison.equal
+    comparison.recorded(ACTION, None, action, encode(action))
+    assert (comparison.compared, comparison.unequal) == (1, 0)
+    assert comparison.only_recorded == [("action", None, 3, 2)]
+    turned = dataclasses.replace(later, arrived=False)
+    found = comparison.replayed(ACTION, None, turned, encode(turned))
+    assert [(d.field, d.recorded, d.replayed, d.tolerated) for d in found] == [("arrived", "True", "False", False)]
+    assert (comparison.beyond, comparison.only_recorded, comparison.equal) == (1, [], False)
+
+
+def test_every_tolerance_has_a_reason_and_a_field():
+    for (topic, name), tolerance in TOLERANCES.items():
+        assert tolerance.reason
+        assert name == "*" or name in field_types(TOPICS[topic].type)
+    assert tolerance_of("action", "translation_m").absolute == 0
+    assert tolerance_of("belief", "mean_m") == TOLERANCES[BELIEF.name, "mean_m"]
