@@ -1,0 +1,111 @@
+"""What every contender is measured by: the same frames, the same pace, the same clock.
+
+One-way latency: the sender notes the time right before it takes a message in hand, the receiver when it has it, both on
+the clock that all processes of a machine share.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from shared.errors import SaccadeError
+from shared.geometry import IMAGE_SIZE_PX
+from shared.messages import Frame, decode, encode
+
+ENCODED, CODED = KINDS = ("bytes", "encode + decode")  # from wire bytes to a buffer of them; from Frame to Frame
+RING = 8  # different images, so that no message finds its bytes in a cache because the last one was the same
+PROBE = b"probe"  # sent until the receiver is known to hear
+PROBE_S = 0.05
+SETTLE_S = 0.2
+READY = "ready"
+
+Send = Callable[[bytes], None]  # wire bytes on their way
+Receive = Callable[[], Any]  # waits for the next message and gives a readable buffer of its bytes
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How much is measured: in each round `messages`, after `warmup` that do not count."""
+
+    rounds: int = 6
+    messages: int = 200
+    warmup: int = 20
+    period_s: float = 0.01  # between two messages: nothing waits behind another, as in lockstep
+
+    @property
+    def total(self) -> int:
+        """Messages of a round."""
+        return self.warmup + self.messages
+
+    @property
+    def limit_s(self) -> float:
+        """After so long a round has failed, seconds."""
+        return 30 + self.total * (self.period_s + 0.05)
+
+
+def frames() -> list[Frame]:
+    """RING camera images of noise, the same in every process."""
+    rng = np.random.default_rng(0)
+    size = (IMAGE_SIZE_PX, IMAGE_SIZE_PX, 3)
+    return [Frame(run="bench", episode=0, step=i, rgb=rng.integers(0, 256, size, dtype=np.uint8),
+                  intrinsics_px=np.ones(4), world_from_camera=np.eye(4)) for i in range(RING)]
+
+
+def send_all(plan: Plan, kind: str, send: Send, folder: Path) -> np.ndarray:
+    """Sends a round's messages; when each was begun, nanoseconds [plan.total]."""
+    images = frames()
+    payloads = [encode(image) for image in images]
+    while not (folder / READY).exists():
+        send(PROBE)
+        time.sleep(PROBE_S)
+    time.sleep(SETTLE_S)
+    began = np.zeros(plan.total, np.int64)
+    for i in range(plan.total):
+        time.sleep(plan.period_s)
+        began[i] = time.monotonic_ns()
+        send(payloads[i % RING] if kind == ENCODED else encode(images[i % RING]))
+    return began
+
+
+def receive_all(plan: Plan, kind: str, receive: Receive, folder: Path) -> np.ndarray:
+    """When each of a round's messages was there, nanoseconds [plan.total]. Raises SaccadeError for a wrong one."""
+    expected = [np.frombuffer(encode(image), np.uint8) for image in frames()]
+    arrived = np.zeros(plan.total, np.int64)
+    i = 0
+    while i < plan.total:
+        payload = receive()
+        if len(payload) == len(PROBE):
+            (folder / READY).touch()
+            continue
+        message = decode(Frame, payload) if kind == CODED else None
+        arrived[i] = time.monotonic_ns()
+        if not np.array_equal(np.frombuffer(payload, np.uint8), expected[i % RING]):
+            raise SaccadeError(f"message {i} is not the one that was sent")
+        del payload, message  # views of shared memory keep it from being used again
+        i += 1
+    return arrived
+
+
+def within_one_process(plan: Plan, kind: str) -> np.ndarray:
+    """The yardsticks, at the same pace: a plain copy of a frame's wire bytes into memory that is there, and encode and
+    decode with no transport between; nanoseconds [plan.total]."""
+    images = frames()
+    sources = [np.frombuffer(encode(image), np.uint8) for image in images]
+    target = np.empty_like(sources[0])
+    taken = np.zeros(plan.total, np.int64)
+    for i in range(plan.total):
+        time.sleep(plan.period_s)
+        start, message = time.monotonic_ns(), None
+        if kind == ENCODED:
+            np.copyto(target, sources[i % RING])
+        else:
+            message = decode(Frame, encode(images[i % RING]))
+        taken[i] = time.monotonic_ns() - start
+        del message
+    return taken

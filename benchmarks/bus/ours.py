@@ -1,0 +1,78 @@
+"""Our bus as the services use it: a client keeps what it publishes, a process routes, a client's inbox receives."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import closing, contextmanager, nullcontext
+from pathlib import Path
+from unittest.mock import patch
+
+from benchmarks.bus.measure import Plan, Receive, Send, frames
+from benchmarks.bus.peer import run_pair
+from shared.bus import ZenohBus, free_endpoint
+from shared.config import Config
+from shared.outbox import Outbox
+from shared.process import Inbox
+from shared.topics import FRAME
+
+WORLD = "bench"
+CONFIG = "config.json"
+
+
+class Ours:
+    """ZenohBus through a router; with shared memory (shm), as is by default, or without."""
+
+    modules = ("zenoh",)
+
+    def __init__(self, name: str, shared_memory: bool) -> None:
+        self.name = name
+        self._shared_memory = shared_memory
+
+    def run(self, plan: Plan, folder: Path) -> None:
+        """The router is the one of every run."""
+        endpoint = free_endpoint("tcp/127.0.0.1:0")
+        Config().with_values({"bus.endpoint": endpoint, "bus.world": WORLD}).save(folder / CONFIG)
+        router = [sys.executable, "-m", "services.router", "--config", str(folder / CONFIG)]
+        run_pair(self, plan, folder, endpoint, beside=router)
+
+    @contextmanager
+    def sender(self, address: str) -> Iterator[Send]:
+        """Publishes frames, and keeps them for whoever missed one."""
+        outbox, frame = Outbox(), frames()[0]
+        with closing(self._bus(address)) as bus:
+
+            def send(payload: bytes) -> None:
+                outbox.keep(FRAME, None, frame, payload)
+                bus.publish(FRAME, None, payload)
+
+            bus.answer((FRAME,), outbox.answer)
+            yield send
+
+    @contextmanager
+    def receiver(self, address: str) -> Iterator[Receive]:
+        """Takes frames out of the inbox on the main thread."""
+        inbox = Inbox()
+        with closing(self._bus(address)) as bus:
+            bus.subscribe((FRAME,), inbox.put)
+            yield lambda: inbox.get()[2]
+
+    def _bus(self, endpoint: str) -> ZenohBus:
+        with nullcontext() if self._shared_memory else _no_shared_memory():
+            return ZenohBus(endpoint, world=WORLD)
+
+
+@contextmanager
+def _no_shared_memory() -> Iterator[None]:
+    """Clients opened within have it off, whatever the router has. The bus needs no such switch for anything else."""
+    import zenoh
+
+    plain = zenoh.Config
+
+    def config() -> zenoh.Config:
+        made = plain()
+        made.insert_json5("transport/shared_memory/enabled", "false")
+        return made
+
+    with patch.object(zenoh, "Config", config):
+        yield
