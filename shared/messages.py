@@ -20,6 +20,7 @@ ARRAY_EXTENSION = 1  # msgpack ext type: msgpack([dtype, shape]) followed by the
 MAX_SIDE = 8192
 MAX_BYTES = 32 * 1024 * 1024
 MAX_TEXT = 4096
+HEADER_BYTES = 128  # of an array: more than any needs
 
 
 class MessageError(ValueError):
@@ -225,8 +226,8 @@ def _pack_array(value: Any) -> msgpack.ExtType:
 def _unpack_array(code: int, data: bytes) -> np.ndarray:
     if code != ARRAY_EXTENSION:
         raise MessageError(f"unknown extension type {code}")
-    unpacker = msgpack.Unpacker(max_buffer_size=len(data) or 1, max_array_len=16, max_str_len=8)
-    unpacker.feed(data[:128])
+    unpacker = msgpack.Unpacker(max_buffer_size=HEADER_BYTES, max_array_len=16, max_str_len=8)
+    unpacker.feed(data[:HEADER_BYTES])
     header = unpacker.unpack()
     if not (isinstance(header, list) and len(header) == 2 and header[0] in ("u1", "f4", "f8") and
             isinstance(header[1], list) and len(header[1]) <= 4 and

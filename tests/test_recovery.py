@@ -14,6 +14,8 @@ import pytest
 
 from deploy.launch import PROCESSES, launch
 from deploy.logs.check import missing
+from deploy.registry import local_pairs
+from shared.config import Config
 from shared.loop import run_local
 from shared.reading import RunReader
 from shared.topics import FRAME, STATUS
@@ -84,3 +86,51 @@ def test_a_service_killed_at_any_moment_goes_on_where_it_was(tmp_path, name):
     results, said = disturbed(run_dir, dict.fromkeys(moments, kill))
     assert_as_if_nothing_had_happened(run_dir, results)
     assert [text for text in said if text.startswith(f"{name} is started again: ")]
+
+
+def test_a_service_that_hangs_is_named_and_goes_on_when_it_is_let(tmp_path, monkeypatch):
+    monkeypatch.setattr("deploy.supervisor.HUNG_KILLED_S", 1e9)
+    run_dir, said = tmp_path / "run", []
+    stopped = []
+
+    def say(text: str) -> None:
+        said.append(text)
+        if text.startswith("belief hangs: nothing was heard of it for "):
+            os.kill(stopped[0], signal.SIGCONT)
+
+    def stop(topic, part, message):
+        if topic == FRAME and not stopped:
+            stopped.append(process_of(run_dir, "belief"))
+            os.kill(stopped[0], signal.SIGSTOP)
+
+    results = launch(configuration(EPISODES, STEPS), run_dir, stop, FAKES, say)
+    assert_as_if_nothing_had_happened(run_dir, results)
+    assert [text.split(":")[0] for text in said] == ["belief hangs", "belief is heard again"]
+
+
+def test_a_service_that_hangs_for_long_is_ended_and_started_again(tmp_path, monkeypatch):
+    monkeypatch.setattr("deploy.supervisor.HUNG_KILLED_S", 3.0)
+    run_dir = tmp_path / "run"
+    results, said = disturbed(run_dir, {(0, 0): lambda: os.kill(process_of(run_dir, "perception"), signal.SIGSTOP)})
+    assert_as_if_nothing_had_happened(run_dir, results)
+    assert [text.split(":")[0] for text in said][:3] == [
+        "perception hangs", "perception is ended", "perception is started again"]
+
+
+def test_the_shipped_agent_ends_where_it_would_have_ended(tmp_path):
+    """The real services: networks, particles and plans come back to the same bytes."""
+    config = Config().with_values({"scene.names": ["soup_can", "rice_box"], "scene.count": 1, "seed": 11,
+                                   "simulator.max_steps": 9})
+    run_dir, moments = tmp_path / "run", {2: "perception", 4: "belief", 6: "planner", 7: "simulator"}
+
+    def kill(topic, part, message):
+        if topic == FRAME and (name := moments.pop(message.step, None)):
+            os.kill(process_of(run_dir, name), signal.SIGKILL)
+
+    launch(config, run_dir, kill, say=lambda text: None)
+    assert not moments
+    assert missing(run_dir / "run.mcap").complete
+    expected = defaultdict(list)
+    run_local(local_pairs("sceneccn", config), config.names, "run", None,
+              lambda t, p, m, payload: expected[t.name, p].append(payload), encoded=True)
+    assert logged(run_dir / "run.mcap") == dict(expected)
