@@ -1,0 +1,79 @@
+"""`python -m benchmarks.loop [out.json]`: closed-loop steps per second over the bus, with and without the recorder,
+against the same cores in one process; the same scenes, in turn, round after round."""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from deploy.launch import PROCESSES, launch
+from deploy.registry import local_pairs
+from shared.config import Config
+from shared.loop import run_local
+from shared.topics import FRAME, TRUTH
+
+ROUNDS = 5
+CONFIG = Config().with_values({"seed": 3, "scene.names": ["coffee_can", "cereal_box", "rice_box", "soup_can",
+                                                          "squeeze_bottle"], "scene.count": 4})
+
+
+class Clock:
+    """Steps, and seconds from the first frame to the last truth, as they are seen."""
+
+    def __init__(self) -> None:
+        self.steps, self.start_s, self.end_s = 0, 0.0, 0.0
+
+    def see(self, topic, part, message, payload=None) -> None:
+        """For `on_message`."""
+        if topic == FRAME:
+            self.start_s = self.start_s or time.perf_counter()
+            self.steps += 1
+        elif topic == TRUTH:
+            self.end_s = time.perf_counter()
+
+    @property
+    def steps_per_s(self) -> float:
+        """In the closed loop."""
+        return self.steps / (self.end_s - self.start_s)
+
+
+def here() -> float:
+    """Steps per second in this process, each message encoded and decoded as on the bus."""
+    clock = Clock()
+    run_local(local_pairs("sceneccn", CONFIG), CONFIG.names, "loop", on_message=clock.see, encoded=True)
+    return clock.steps_per_s
+
+
+def on_bus(recorder: bool) -> float:
+    """Steps per second of processes on Zenoh."""
+    clock = Clock()
+    with tempfile.TemporaryDirectory() as folder:
+        processes = [p for p in PROCESSES if recorder or p.name != "recorder"]
+        launch(CONFIG, Path(folder) / "loop", clock.see, processes)
+    return clock.steps_per_s
+
+
+def main() -> None:
+    found: dict[str, list[float]] = {"one process": [], "bus": [], "bus, recorded": []}
+    for _ in range(ROUNDS):
+        found["one process"].append(here())
+        found["bus"].append(on_bus(recorder=False))
+        found["bus, recorded"].append(on_bus(recorder=True))
+    medians = {name: float(np.median(values)) for name, values in found.items()}
+    table = Table("where", "steps per s", "of one process", "of the bus without recorder")
+    for name, value in medians.items():
+        table.add_row(name, f"{value:.2f}", f"{value / medians['one process']:.3f}", f"{value / medians['bus']:.3f}")
+    Console().print(table)
+    if len(sys.argv) > 1:
+        Path(sys.argv[1]).write_text(json.dumps(found, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

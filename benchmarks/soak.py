@@ -1,0 +1,94 @@
+"""`python -m benchmarks.soak [minutes]`: runs, one after the other, in which a process chosen by chance is killed every
+few seconds; counts what was lost. Each run's actions must be those of the run in one process, to the byte."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import sys
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from deploy.launch import PROCESSES, launch
+from deploy.logs.check import missing
+from deploy.registry import local_pairs
+from shared.config import Config
+from shared.errors import SaccadeError
+from shared.loop import run_local
+from shared.messages import encode
+from shared.reading import RunReader
+from shared.topics import ACTION, STATUS
+
+EVERY_S = (4.0, 10.0)  # between two kills
+EPISODES = 6
+NAMES = ["soup_can", "rice_box"]
+
+
+def child(name: str) -> int | None:
+    """The process id of this process's child of that name."""
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            if int(path.read_text().rsplit(")", 1)[1].split()[1]) != os.getpid():
+                continue
+            if f"services.{name}".encode() in (path.parent / "cmdline").read_bytes().split(b"\0"):
+                return int(path.parent.name)
+        except OSError:
+            continue
+    return None
+
+
+def soak(seed: int, folder: Path, counts: Counter, rng: random.Random) -> None:
+    """One run of several episodes; adds to the counts."""
+    config = Config().with_values({"seed": seed, "scene.names": NAMES, "scene.count": EPISODES})
+    due_s = time.monotonic() + rng.uniform(*EVERY_S)
+
+    def kill(topic, part, message) -> None:
+        nonlocal due_s
+        if topic == STATUS and time.monotonic() > due_s:
+            due_s = time.monotonic() + rng.uniform(*EVERY_S)
+            name = rng.choice([process.name for process in PROCESSES])
+            if (process := child(name)) is not None:
+                os.kill(process, signal.SIGKILL)
+                counts[f"killed: {name}"] += 1
+
+    try:
+        results = launch(config, folder / "run", kill, say=lambda text: None)
+    except SaccadeError as error:
+        print(f"seed {seed}: {error}")
+        results = []
+    expected: list[bytes] = []
+    run_local(local_pairs("sceneccn", config), config.names, "run",
+              on_message=lambda t, p, m, _: expected.append(encode(m)) if t == ACTION else None)
+    report = missing(folder / "run" / "run.mcap")
+    actions = [encode(m) for t, _, m in RunReader(folder / "run" / "run.mcap") if t == ACTION]
+    counts["episodes"] += EPISODES
+    counts["messages"] += report.messages
+    counts["lost episodes"] += EPISODES - len(results)
+    counts["lost messages"] += sum(report.lost.values()) + len(report.absent) + (report.cut is not None)
+    counts["messages said twice"] += report.repeated
+    counts["runs with other actions"] += sorted(actions) != sorted(expected)
+
+
+def main() -> None:
+    minutes = float(sys.argv[1]) if len(sys.argv) > 1 else 30.0
+    end_s, counts, seed, rng = time.monotonic() + 60 * minutes, Counter(), 0, random.Random(0)
+    with Console().status("killing") as status:
+        while time.monotonic() < end_s:
+            with tempfile.TemporaryDirectory() as folder:
+                soak(seed, Path(folder), counts, rng)
+            seed += 1
+            status.update(", ".join(f"{name} {count}" for name, count in sorted(counts.items())))
+    table = Table("what", "how many")
+    for name, count in sorted(counts.items()):
+        table.add_row(name, str(count))
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    main()
