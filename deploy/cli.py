@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
+from deploy.logs.cli import app as logs
 from deploy.threads import prefer_one_thread
 from shared.errors import SaccadeError
 
@@ -17,6 +18,7 @@ EXIT_ERROR, EXIT_INTERRUPTED = 2, 130
 
 app = typer.Typer(name="saccade", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
                   help="An active-vision agent: it looks, believes and moves until it sees the goal image.")
+app.add_typer(logs, name="log")
 
 Objects = Annotated[Literal["pantry", "ycb"] | None, typer.Option(help="object set [default: pantry]")]
 Names = Annotated[str | None, typer.Option(help="only these objects of the set: a,b", metavar="NAMES")]
