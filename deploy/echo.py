@@ -96,7 +96,8 @@ def of_array(value: np.ndarray) -> str:
     if value.size == 0:
         return f"{kind}, empty"
     if value.size <= MOST_NUMBERS:
-        numbers = np.array2string(value, separator=", ", formatter={"all": lambda x: f"{x + 0:.6g}"}, max_line_width=10_000)
+        numbers = np.array2string(value, separator=", ", max_line_width=10_000,
+                                  formatter={"all": lambda number: f"{number + 0:.6g}"})
         return f"{kind} " + " ".join(numbers.split())
     return f"{kind}, min {value.min():.6g}, mean {value.mean(dtype=np.float64):.6g}, max {value.max():.6g}"
 
