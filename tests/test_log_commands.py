@@ -154,6 +154,16 @@ def test_a_cut_that_lacks_something_is_not_complete(run, tmp_path):
     assert [at[2] for at in missing(tmp_path / "d.mcap").absent] == [2] * 4 + [4] * 4
 
 
+def test_a_log_that_was_recorded_from_a_later_step_on_is_complete_from_there(tmp_path):
+    messages = [m for m in story() if m[2].step >= 3]
+    write(tmp_path / "late.mcap", messages, cut={"start": 3})
+    assert missing(tmp_path / "late.mcap").complete
+    write(tmp_path / "later.mcap", messages, cut={"start": 2})
+    assert {at[2] for at in missing(tmp_path / "later.mcap").absent} == {2}
+    assert cut(tmp_path / "late.mcap", tmp_path / "c.mcap", end=4) == Range(1, 3, 4)
+    assert missing(tmp_path / "c.mcap").complete
+
+
 def test_cuts_up_to_the_end_and_of_cuts(monkeypatch, capsys, run, tmp_path):
     code, out, _ = call(monkeypatch, capsys, "log", "cut", run, "--out", tmp_path / "c.mcap", "--start", 3)
     assert (code, out) == (0, f"steps 3 to 6 of episode 1 written to {tmp_path / 'c.mcap'}\n")

@@ -58,7 +58,7 @@ def missing(path: Path) -> Missing:
     steps: dict[tuple[str, int], dict[int, set[str]]] = {}
     done: set[tuple[str, int, int]] = set()
     for topic, part, message in reader:
-        sequences = sequences or Sequences(from_start=range_of(reader) is None)
+        sequences = sequences or Sequences(from_start=True, cut=range_of(reader) is not None)
         report.messages += 1
         key = topic.key(reader.world, part)
         lost = sequences.take(topic, part, message)
@@ -81,7 +81,7 @@ def _absent(steps: dict[tuple[str, int], dict[int, set[str]]], done: set[tuple[s
     absent = []
     for episode, there in steps.items():
         last = max(there)
-        expected = range(last + 1) if kept is None else range(kept.start, max(kept.end, last) + 1)
+        expected = range(last + 1) if kept is None else range(kept.start, max(kept.end or 0, last) + 1)
         absent += [(*episode, step, key) for step in expected if (*episode, step) not in done
                    for key in keys - there.get(step, set())]
     return sorted(absent)

@@ -69,7 +69,7 @@ def cut(run: Run, out: Out,
     from deploy.logs.source import log_of
 
     kept = cut_log(log_of(run), out, episode=episode, start=start, end=end)
-    print(f"steps {kept.start} to {kept.end} of episode {kept.episode} written to {out}")
+    print(f"{kept} written to {out}")
     for line in missing(out).lines():
         print(line)
 

@@ -16,18 +16,24 @@ CUT = "cut"  # metadata of a log that was cut out of another: which steps it has
 
 @dataclass(frozen=True)
 class Range:
-    """Steps of an episode, the last one included."""
+    """Steps of an episode (None: of every one), `end` included (None: up to the last)."""
 
-    episode: int
+    episode: int | None
     start: int
-    end: int
+    end: int | None
+
+    def __str__(self) -> str:
+        steps = f"steps {self.start} to {self.end}" if self.end is not None else f"steps from {self.start} on"
+        return steps + (f" of episode {self.episode}" if self.episode is not None else "")
 
 
 def range_of(reader: RunReader) -> Range | None:
-    """Which steps a log was cut to; None for a whole one. Known once its first entry has been read."""
+    """Which steps a log was cut to, or recorded from; None for a whole one. Known once its first entry has been read.
+    Raises SaccadeError where the log does not say it."""
     told = reader.metadata.get(CUT)
     try:
-        return Range(*(int(told[name]) for name in ("episode", "start", "end"))) if told else None
+        return Range(*(int(told[name]) if name == "start" or name in told else None
+                       for name in ("episode", "start", "end"))) if told else None
     except (KeyError, ValueError) as error:
         raise SaccadeError(f"log {reader.path} was cut, but does not say to which steps") from error
 
@@ -81,7 +87,7 @@ def _find(log: Path, episode: int | None, start: int, end: int | None) -> tuple[
     if not chosen:
         asked = f"from {start} on" if end is None else f"{start} to {end}"
         raise SaccadeError(f"episode {episode} of {log} has the steps {min(steps)} to {max(steps)}: none of {asked}")
-    last = max(*steps, before.end)
+    last = max(*steps, before.end or 0)
     kept = Range(episode, max(start, before.start), last if end is None else min(end, last))
     return kept, (min(first for first, _ in chosen.values()), max(last for _, last in chosen.values()))
 

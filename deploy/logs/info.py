@@ -72,7 +72,7 @@ def gather(log: Path) -> LogInfo:
     reader = RunReader(log)
     info, sequences = LogInfo(reader, log.stat().st_size), None
     for topic, part, payload, time_ns in reader.entries():
-        sequences = sequences or Sequences(from_start=range_of(reader) is None)
+        sequences = sequences or Sequences(from_start=True, cut=range_of(reader) is not None)
         key = topic.key(reader.world, part)
         info.keys.setdefault(key, KeyInfo()).take(len(payload), time_ns)
         try:
@@ -110,7 +110,7 @@ def lines(info: LogInfo) -> Iterator[str]:
     for episode in sorted(info.steps.keys() | info.results.keys()):
         yield f"episode {episode}: {_ending(info.steps.get(episode), info.results.get(episode))}"
     if info.kept is not None:
-        yield f"cut to the steps {info.kept.start} to {info.kept.end} of episode {info.kept.episode}"
+        yield f"cut to the {info.kept}"
     if told := reader.metadata.get(RECOVERED):
         yield f"recovered from {told.get('log', '')}; lost: {told.get('lost') or 'nothing'}"
     if info.refused:
