@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
+from deploy.logs.cli import app as logs
 from deploy.threads import prefer_one_thread
 from shared.errors import SaccadeError
 
@@ -17,6 +18,7 @@ EXIT_ERROR, EXIT_INTERRUPTED = 2, 130
 
 app = typer.Typer(name="saccade", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
                   help="An active-vision agent: it looks, believes and moves until it sees the goal image.")
+app.add_typer(logs, name="log")
 
 Objects = Annotated[Literal["pantry", "ycb"] | None, typer.Option(help="object set [default: pantry]")]
 Names = Annotated[str | None, typer.Option(help="only these objects of the set: a,b", metavar="NAMES")]
@@ -208,6 +210,30 @@ def topics(world: Annotated[str, typer.Option(help="world, the second part of ev
         table.add_row(topic.name, key, topic.type.__name__, often, about)
     wide(console := Console())
     console.print(table, markup=False)
+
+
+Key = Annotated[str, typer.Argument(metavar="KEY", help="full key or topic[/part]; * stands for any")]
+LogFile = Annotated[Path | None, typer.Option(help="a log, or a run's folder, instead of a bus", metavar="RUN")]
+Count = Annotated[int | None, typer.Option(min=1, help="end after so many messages")]
+Endpoint = Annotated[str | None, typer.Option(help="the bus, e.g. tcp/127.0.0.1:7447")]
+OfRun = Annotated[Path | None, typer.Option(
+    help="folder of a run that goes on, for its bus [default: the newest in runs/ that answers]", metavar="FOLDER")]
+
+
+@app.command()
+def echo(key: Key, log: LogFile = None, count: Count = None, endpoint: Endpoint = None, run: OfRun = None) -> None:
+    """Print messages, live or from a log; Ctrl-C ends it."""
+    from deploy.echo import echo as print_messages
+
+    print_messages(key, log=log, count=count, endpoint=endpoint, run=run)
+
+
+@app.command()
+def hz(key: Key, log: LogFile = None, count: Count = None, endpoint: Endpoint = None, run: OfRun = None) -> None:
+    """Show how often messages come and how evenly, live or from a log; Ctrl-C ends it."""
+    from deploy.hz import hz as show_rates
+
+    show_rates(key, log=log, count=count, endpoint=endpoint, run=run)
 
 
 def configured(path: Path | None, given: dict[str, Any], values: list[str] | None) -> Any:

@@ -88,5 +88,9 @@ class RunReader:
 
     @property
     def format(self) -> int:
-        """The format that the log was written in; known once its first entry has been read."""
-        return int(self.metadata.get(LOG, {}).get("format", OLDEST))
+        """The format that the log was written in; known once its first entry has been read. Raises SaccadeError where
+        it is no number."""
+        told = self.metadata.get(LOG, {}).get("format", str(OLDEST))
+        if not (told.isascii() and told.isdigit() and len(told) < 10):
+            raise SaccadeError(f"log {self.path} says that its format is {told!r}, which is no number")
+        return int(told)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import time
@@ -32,7 +33,8 @@ class RecordingStopped(SaccadeError):
 class RunLog:
     """Writes one run's log. `metadata`: names to maps of text, such as versions and weights' hashes.
 
-    Raises SaccadeError if the file cannot be created or is there already; RecordingStopped, once, when it is full.
+    Raises SaccadeError if the file cannot be created or is there already; RecordingStopped, once, when the
+    disk is full or the log was removed.
     """
 
     def __init__(self, path: Path, *, world: str, configuration: str = "{}",
@@ -67,12 +69,14 @@ class RunLog:
         if self._writer is not None:
             self._flushed_s = time.monotonic()
             self._guarded(lambda: (self._writer.flush(), self._file.sync()))
+            self._stop_if_gone()
 
     def close(self) -> None:
         """Writes the index and closes the file."""
         if self._writer is not None:
             self._guarded(self._writer.finish)
             self._guarded(self._file.sync)
+            self._stop_if_gone()
             self._writer = None
         self._file.close()
 
@@ -85,6 +89,15 @@ class RunLog:
             self._file.close()
             raise RecordingStopped(f"recording stopped ({error.strerror}): {self.path} keeps what was recorded; "
                                    "free some space before the next run") from error
+
+    def _stop_if_gone(self) -> None:
+        """The file of a removed folder can be written on and on, and is nowhere once it is closed."""
+        if self._file.is_gone():
+            self._writer = None
+            self._file.close()
+            what = "file" if self.path.parent.is_dir() else "folder"
+            raise RecordingStopped(f"recording stopped: the log's {what} is gone ({self.path}): what is recorded from "
+                                   "now on is lost; leave the folder of a run where it is until the run has ended")
 
     def _start(self, configuration: str, metadata: Mapping[str, Mapping[str, str]]) -> None:
         self._writer.start()
@@ -109,6 +122,7 @@ class _WholeRecords:
     """The file below mcap's Writer, which writes whole records only: of one that does not fit nothing is left."""
 
     def __init__(self, path: Path) -> None:
+        self._path = path.absolute()
         self._raw = path.open("xb", buffering=0)  # a log is never written over
         self._end = 0
 
@@ -127,6 +141,14 @@ class _WholeRecords:
 
     def sync(self) -> None:
         os.fdatasync(self._raw.fileno())
+
+    def is_gone(self) -> bool:
+        """Whether it has been removed; one that was moved or has another name is still there."""
+        held = os.fstat(self._raw.fileno())
+        with contextlib.suppress(OSError):
+            if os.path.samestat(held, os.stat(self._path)):
+                return False
+        return held.st_nlink == 0
 
     def end_early(self, reason: str) -> None:
         """Cuts off a half-written record and, where there is room, ends the file as MCAP asks, without an index."""

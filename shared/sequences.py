@@ -32,8 +32,9 @@ class Sequences:
     A status is not part of an episode: it counts from 0 in every process, and nobody can ask for it again.
     """
 
-    def __init__(self, *, from_start: bool = False) -> None:
+    def __init__(self, *, from_start: bool = False, cut: bool = False) -> None:
         self._from_start = from_start  # whether this listens since before the first message
+        self._cut = cut  # whether every episode may begin at any number
         self._next: dict[Key, dict[Episode, int]] = {}
         self._missing: dict[Key, set[tuple[str, int, int]]] = {}
 
@@ -45,7 +46,8 @@ class Sequences:
             self._next[key] = {("", 0): seq + 1}
             return max(0, seq - known)
         episodes = self._next.setdefault(key, {})
-        due = episodes.get(episode, 0 if episodes or self._from_start else seq)
+        first = 0 if (episodes or self._from_start) and not self._cut else seq
+        due = episodes.get(episode, first)
         if seq >= due:
             episodes[episode] = seq + 1
             if seq > due:

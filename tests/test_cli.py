@@ -82,7 +82,7 @@ def small(weights, **values) -> Config:
 def test_help_lists_the_commands(monkeypatch, capsys):
     code, out, _ = call(monkeypatch, capsys, "--help")
     assert code == 0
-    for command in ("run", "bench", "report", "picture", "train", "doctor", "topics"):
+    for command in ("run", "bench", "report", "picture", "train", "doctor", "topics", "echo", "hz", "log"):
         assert f" {command} " in out
 
 

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from deploy.logs.cut import Range, range_of
 from shared.reading import RunReader
 from shared.sequences import Sequences
 from shared.topics import TOPICS, TRUTH
+
+MOST_STRETCHES = 6  # of steps that are named one by one
 
 
 @dataclass
@@ -26,34 +31,70 @@ class Missing:
 
     @property
     def complete(self) -> bool:
-        """Nothing is missing."""
-        return not (self.lost or self.absent or self.repeated or self.refused or self.cut)
+        """There is something, and nothing is missing."""
+        return self.messages > 0 and not (self.lost or self.absent or self.repeated or self.refused or self.cut)
+
+    def lines(self) -> Iterator[str]:
+        """What is missing, a line each."""
+        if self.cut:
+            yield self.cut
+        if not self.messages:
+            yield "holds no message"
+        for key, count in sorted(self.lost.items()):
+            yield f"{key}: {count} messages lost, by their sequence numbers"
+        for (run, episode, key), group in itertools.groupby(
+                sorted(self.absent, key=lambda at: (*at[:2], at[3], at[2])), lambda at: (*at[:2], at[3])):
+            yield f"{key}: not there in episode {episode} of {run}, step {abbreviated(at[2] for at in group)}"
+        if self.repeated:
+            yield f"{self.repeated} messages are there twice"
+        if self.refused:
+            yield f"{self.refused} entries are no valid messages"
 
 
 def missing(path: Path) -> Missing:
-    """Reads a log and reports gaps. The last step of an episode that is done needs no answer to its frame."""
-    report, reader, sequences = Missing(), RunReader(path), Sequences(from_start=True)
-    steps: dict[tuple[str, int, int], set[str]] = {}
+    """Reads a log and reports gaps. The last step of an episode that is done needs no answer to its frame; of a log
+    that was cut out of another only its range is expected."""
+    report, reader, sequences = Missing(), RunReader(path), None
+    steps: dict[tuple[str, int], dict[int, set[str]]] = {}
     done: set[tuple[str, int, int]] = set()
-    keys: set[str] = set()
     for topic, part, message in reader:
+        sequences = sequences or Sequences(from_start=True, cut=range_of(reader) is not None)
         report.messages += 1
         key = topic.key(reader.world, part)
         lost = sequences.take(topic, part, message)
         report.repeated += lost is None
-        report.heartbeats += 0 if topic.in_step else lost
+        report.heartbeats += 0 if topic.in_step else lost or 0
         if topic.in_step and not topic.latched:
-            at = (message.run, message.episode, message.step)
-            keys.add(key)
-            steps.setdefault(at, set()).add(key)
+            steps.setdefault((message.run, message.episode), {}).setdefault(message.step, set()).add(key)
             if topic == TRUTH and message.done:
-                done.add(at)
-    for run, episode in {at[:2] for at in steps}:
-        for step in range(max(at[2] for at in steps if at[:2] == (run, episode)) + 1):
-            at = (run, episode, step)
-            if at not in done:
-                report.absent += [(*at, key) for key in sorted(keys - steps.get(at, set()))]
-    report.absent.sort()
-    report.lost = {TOPICS[name].key(reader.world, part): lost for (name, part), lost in sequences.missing.items()}
+                done.add((message.run, message.episode, message.step))
+    report.absent = _absent(steps, done, range_of(reader))
+    if sequences is not None:
+        report.lost = {TOPICS[name].key(reader.world, part): lost for (name, part), lost in sequences.missing.items()}
     report.refused, report.cut = reader.refused, reader.cut
     return report
+
+
+def _absent(steps: dict[tuple[str, int], dict[int, set[str]]], done: set[tuple[str, int, int]],
+            kept: Range | None) -> list[tuple[str, int, int, str]]:
+    keys = set().union(*(there for episode in steps.values() for there in episode.values()))
+    absent = []
+    for episode, there in steps.items():
+        last = max(there)
+        expected = range(last + 1) if kept is None else range(kept.start, max(kept.end or 0, last) + 1)
+        absent += [(*episode, step, key) for step in expected if (*episode, step) not in done
+                   for key in keys - there.get(step, set())]
+    return sorted(absent)
+
+
+def abbreviated(numbers: Iterable[int]) -> str:
+    """Ascending numbers as stretches: 1-3, 7, 9-12."""
+    stretches: list[list[int]] = []
+    for number in numbers:
+        if stretches and number == stretches[-1][-1] + 1:
+            stretches[-1][1:] = [number]
+        else:
+            stretches.append([number])
+    told = ["-".join(map(str, stretch)) for stretch in stretches]
+    more = len(told) - MOST_STRETCHES
+    return ", ".join(told[:MOST_STRETCHES]) + (f" and {more} stretches more" if more > 0 else "")

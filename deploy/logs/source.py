@@ -1,4 +1,4 @@
-"""What every export needs: a log's valid messages and their times, and files that are there whole or not at all."""
+"""What commands on logs need: the valid messages and their times, and files that are there whole or not at all."""
 
 from __future__ import annotations
 
@@ -11,11 +11,17 @@ from pathlib import Path
 from rich.console import Console
 from rich.markup import escape
 
+from services.recorder.core import LOG_NAME
 from shared.errors import SaccadeError
 from shared.messages import Message, MessageError, decode
 from shared.reading import Recorded, RunReader
 
 SAY_EVERY = 50  # messages
+
+
+def log_of(run: Path) -> Path:
+    """The log of a run, which is given by its folder or by the log itself."""
+    return run / LOG_NAME if run.is_dir() else run
 
 
 class Log:
@@ -62,7 +68,7 @@ def whole(out: Path) -> Iterator[Path]:
     """A path beside `out`, for a file or a folder, that becomes `out` when all is well and is removed when it is not.
     Raises SaccadeError if `out` is there already or cannot be written."""
     if out.exists():
-        raise SaccadeError(f"{out} is there already: an export needs a new place")
+        raise SaccadeError(f"{out} is there already: give --out a new place")
     partial = out.with_name(f"{out.name}.part")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
