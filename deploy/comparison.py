@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from deploy.tolerances import IGNORED, tolerance_of
-from shared.messages import Message, decode
+from shared.messages import Message, decode, stamp_of
 from shared.topics import Topic
 
 KEPT = 1_000  # differences that are told one by one
@@ -50,13 +50,13 @@ class Comparison:
     _recorded: dict[At, tuple[Topic, bytes]] = field(default_factory=dict)
     _replayed: dict[At, tuple[Topic, bytes]] = field(default_factory=dict)
 
-    def recorded(self, topic: Topic, part: str | None, message: Message, payload: bytes) -> list[Difference]:
-        """A message of the recording; the differences, if its twin is there."""
-        return self._take(self._recorded, self._replayed, topic, part, message, payload)
+    def recorded(self, topic: Topic, part: str | None, payload: bytes) -> list[Difference]:
+        """The wire bytes of a message of the recording; the differences, if its twin is there."""
+        return self._take(self._recorded, self._replayed, topic, part, payload)
 
-    def replayed(self, topic: Topic, part: str | None, message: Message, payload: bytes) -> list[Difference]:
-        """A message of the replay; the differences, if its twin is there."""
-        return self._take(self._replayed, self._recorded, topic, part, message, payload)
+    def replayed(self, topic: Topic, part: str | None, payload: bytes) -> list[Difference]:
+        """The wire bytes of a message of the replay; the differences, if its twin is there."""
+        return self._take(self._replayed, self._recorded, topic, part, payload)
 
     @property
     def equal(self) -> bool:
@@ -73,9 +73,9 @@ class Comparison:
         """What the recording does not have."""
         return sorted(self._replayed, key=str)
 
-    def _take(self, own: dict, other: dict, topic: Topic, part: str | None, message: Message,
-              payload: bytes) -> list[Difference]:
-        at = (topic.name, part, message.episode, message.step)
+    def _take(self, own: dict, other: dict, topic: Topic, part: str | None, payload: bytes) -> list[Difference]:
+        stamp = stamp_of(payload)
+        at = (topic.name, part, stamp.episode, stamp.step)
         if at not in other:
             own[at] = (topic, payload)
             return []
@@ -83,7 +83,7 @@ class Comparison:
         self.compared += 1
         if twin == payload and self.on_pair is None:
             return []
-        pair = message, decode(topic.type, twin)
+        pair = decode(topic.type, payload), decode(topic.type, twin)
         recorded, replayed = pair if own is self._recorded else pair[::-1]
         if self.on_pair is not None:
             self.on_pair(topic, part, recorded, replayed)

@@ -8,6 +8,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -21,7 +22,7 @@ from shared.bus import free_endpoint
 from shared.config import Config, validate
 from shared.errors import SaccadeError
 from shared.loop import READY_STATES
-from shared.messages import Message, MessageError, Status, decode, encode
+from shared.messages import Message, MessageError, Stamp, Status, decode, encode, stamp_of
 from shared.outbox import Outbox
 from shared.reading import Recorded, RunReader
 from shared.recording import RunLog
@@ -111,12 +112,12 @@ def replay_here(replay: Replay, out: Path, keys: Keys, say: Callable[[str], None
     def publish(output: Output) -> None:
         payload = encode(output.message)
         log.write(output.topic, output.part, payload, sequence=output.message.seq)
-        twins.replayed(output.topic, output.part, output.message, payload)
+        twins.replayed(output.topic, output.part, payload)
 
     try:
-        for entry, message in played(replay, keys, say, outcome, twins):
-            log.write(entry.topic, entry.part, entry.payload, sequence=message.seq)
-            waiting = deque([Output(entry.topic, message, entry.part)])
+        for entry, stamp in played(replay, keys, say, outcome, twins):
+            log.write(entry.topic, entry.part, entry.payload, sequence=stamp.seq)
+            waiting = deque([Output(entry.topic, decode(entry.topic.type, entry.payload), entry.part)])
             while waiting:
                 output = waiting.popleft()
                 for stepper in steppers:
@@ -143,20 +144,20 @@ def new_log(out: Path, config: Config) -> RunLog:
 
 
 def played(replay: Replay, keys: Keys, say: Callable[[str], None], outcome: Outcome, twins: Twins,
-           may_go_on: Callable[[Message], bool] = lambda _m: True) -> Iterator[tuple[Recorded, Message]]:
+           may_go_on: Callable[[Stamp], bool] = lambda _stamp: True) -> Iterator[tuple[Recorded, Stamp]]:
     """The inputs when they are due; what the services said in the recording goes to the comparison as it is passed."""
 
     def inputs() -> Iterator[Recorded]:
-        for entry in RunReader(replay.log).entries():
+        for entry in RunReader(replay.log, sums=False).entries():
             if entry.topic in replay.outputs.topics:
                 twins.recorded(entry, replay.outputs)
             else:
                 yield entry
 
-    for entry, message in play(inputs(), replay.selection, replay.pace, keys, one_by_one=replay.one_by_one,
+    for entry, stamp in play(inputs(), replay.selection, replay.pace, keys, one_by_one=replay.one_by_one,
                                may_go_on=may_go_on, say=say):
         outcome.played[entry.topic.name] = outcome.played.get(entry.topic.name, 0) + 1
-        yield entry, message
+        yield entry, stamp
 
 
 class Twins:
@@ -168,18 +169,14 @@ class Twins:
 
     def recorded(self, entry: Recorded, wanted: Selection) -> None:
         """An entry of the old log."""
-        try:
-            message = decode(entry.topic.type, entry.payload)
-        except MessageError:
-            return
-        if (entry.topic, message) in wanted:
-            with self._lock:
-                self._comparison.recorded(entry.topic, entry.part, message, entry.payload)
+        with suppress(MessageError), self._lock:
+            if (entry.topic, stamp_of(entry.payload)) in wanted:
+                self._comparison.recorded(entry.topic, entry.part, entry.payload)
 
-    def replayed(self, topic: Topic, part: str | None, message: Message, payload: bytes) -> None:
+    def replayed(self, topic: Topic, part: str | None, payload: bytes) -> None:
         """What was said now."""
         with self._lock:
-            self._comparison.replayed(topic, part, message, payload)
+            self._comparison.replayed(topic, part, payload)
 
 
 def replay_on_bus(replay: Replay, out: Path, keys: Keys, say: Callable[[str], None],
@@ -245,7 +242,7 @@ class _Playing:
             return False
         if topic not in self._replay.outputs.topics:
             return False
-        self._twins.replayed(topic, part, message, encode(message))
+        self._twins.replayed(topic, part, encode(message))
         for answers in self._reached.values():
             if (topic.name, part) in answers:
                 answers[topic.name, part] += 1
@@ -262,13 +259,13 @@ class _Playing:
                     for cause, answers in self._reached.items()), default=0)
 
     def _play(self, keys: Keys, say: Callable[[str], None]) -> None:
-        def may_go_on(message: Message) -> bool:
-            return any((message.episode, message.step) in s for s in self._steps.values()) or self._behind() < WINDOW
+        def may_go_on(stamp: Stamp) -> bool:
+            return any((stamp.episode, stamp.step) in s for s in self._steps.values()) or self._behind() < WINDOW
 
         try:
-            for entry, message in played(self._replay, keys, say, self.outcome, self._twins, may_go_on):
-                self._steps[entry.topic.name].add((message.episode, message.step))
-                self._outbox.keep(entry.topic, entry.part, message, entry.payload)
+            for entry, stamp in played(self._replay, keys, say, self.outcome, self._twins, may_go_on):
+                self._steps[entry.topic.name].add((stamp.episode, stamp.step))
+                self._outbox.keep(entry.topic, entry.part, stamp, entry.payload)
                 self._graph.bus.publish(entry.topic, entry.part, entry.payload)
         except BaseException as error:
             self._error = error

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 import types
 import typing
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import msgpack
 import numpy as np
@@ -21,6 +22,7 @@ MAX_SIDE = 8192
 MAX_BYTES = 32 * 1024 * 1024
 MAX_TEXT = 4096
 HEADER_BYTES = 128  # of an array: more than any needs
+STAMP_BYTES = 512  # and of the fields that all messages have
 
 
 class MessageError(ValueError):
@@ -247,6 +249,30 @@ def encode(message: Message) -> bytes:
     return msgpack.packb({"type": type(message).__name__, "version": message.VERSION, **fields}, default=_pack_array)
 
 
+class Stamp(NamedTuple):
+    """What every message begins with."""
+
+    run: str
+    episode: int
+    step: int
+    seq: int
+
+
+def stamp_of(payload: bytes) -> Stamp:
+    """The stamp of an encoded message, without the rest of it. Raises MessageError for what does not begin with one."""
+    unpacker = msgpack.Unpacker(max_buffer_size=STAMP_BYTES, max_str_len=STAMP_BYTES)
+    unpacker.feed(payload[:STAMP_BYTES])
+    try:
+        unpacker.read_map_header()
+        fields = {unpacker.unpack(): unpacker.unpack() for _ in range(2 + len(Stamp._fields))}
+        stamp = Stamp(*(fields[name] for name in Stamp._fields))
+    except Exception as error:  # msgpack raises many kinds for bytes that are not msgpack
+        raise MessageError(f"does not begin with a stamp ({type(error).__name__})") from error
+    if [type(value) for value in stamp] != [str, int, int, int]:
+        raise MessageError("does not begin with a stamp")
+    return stamp
+
+
 def decode(message_type: type[Message], payload: bytes) -> Message:
     """The message in `payload`. Raises MessageError with the field that is wrong."""
     if len(payload) > MAX_BYTES:
@@ -273,32 +299,42 @@ def field_types(message_type: type[Message]) -> dict[str, Any]:
     return {f.name: hints[f.name] for f in dataclasses.fields(message_type)}
 
 
+@functools.cache
+def _checks(message_type: type[Message]) -> dict[str, tuple[bool, Any]]:
+    """For each field whether it may be absent, and its ArraySpec or type."""
+    checks = {}
+    for name, hint in field_types(message_type).items():
+        optional = isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union
+        if optional:
+            hint = next(h for h in typing.get_args(hint) if h is not type(None))
+        checks[name] = optional, typing.get_args(hint)[1] if typing.get_origin(hint) is Annotated else hint
+    return checks
+
+
 def _check(message_type: type[Message], fields: dict[str, Any]) -> None:
-    expected = field_types(message_type)
-    if fields.keys() != expected.keys():
-        odd = sorted(fields.keys() ^ expected.keys())
+    checks = _checks(message_type)
+    if fields.keys() != checks.keys():
+        odd = sorted(fields.keys() ^ checks.keys())
         raise MessageError(f"{odd[0]}: {'unknown' if odd[0] in fields else 'missing'} field")
     dimensions: dict[str, int] = {}
-    for name, hint in expected.items():
-        _check_field(name, fields[name], hint, dimensions)
+    for name, (optional, kind) in checks.items():
+        value = fields[name]
+        if not (optional and value is None):
+            _check_field(name, value, kind, dimensions)
 
 
-def _check_field(name: str, value: Any, hint: Any, dimensions: dict[str, int]) -> None:
-    if isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union:
-        if value is None:
-            return
-        hint = next(h for h in typing.get_args(hint) if h is not type(None))
-    if typing.get_origin(hint) is Annotated:
-        _check_array(name, value, typing.get_args(hint)[1], dimensions)
-    elif hint is float:
-        if not isinstance(value, (float, int)) or isinstance(value, bool) or not np.isfinite(value):
+def _check_field(name: str, value: Any, kind: Any, dimensions: dict[str, int]) -> None:
+    if isinstance(kind, ArraySpec):
+        _check_array(name, value, kind, dimensions)
+    elif kind is float:
+        if not isinstance(value, (float, int)) or isinstance(value, bool) or not math.isfinite(value):
             raise MessageError(f"{name}: not a finite number")
-    elif hint == list[str]:
+    elif kind == list[str]:
         if not isinstance(value, list) or not all(isinstance(v, str) for v in value):
             raise MessageError(f"{name}: not a list of texts")
-    elif type(value) is not hint:
-        raise MessageError(f"{name}: {type(value).__name__}, not {hint.__name__}")
-    elif hint is int and not 0 <= value < 2 ** 63:
+    elif type(value) is not kind:
+        raise MessageError(f"{name}: {type(value).__name__}, not {kind.__name__}")
+    elif kind is int and not 0 <= value < 2 ** 63:
         raise MessageError(f"{name}: out of range")
 
 

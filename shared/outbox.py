@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from shared.messages import Message
+from shared.messages import Message, Stamp
 from shared.topics import Topic
 
 Since = tuple[str, int, int]  # run, episode, step
@@ -35,7 +35,7 @@ class Outbox:
         self._kept: deque[Kept] = deque()
         self._lock = threading.Lock()
 
-    def keep(self, topic: Topic, part: str | None, message: Message, payload: bytes) -> None:
+    def keep(self, topic: Topic, part: str | None, message: Message | Stamp, payload: bytes) -> None:
         """To be called before the message is published: what a reader misses it can then ask for."""
         kept = Kept(topic, part, payload, (message.run, message.episode, message.step), time.time_ns())
         with self._lock:

@@ -9,7 +9,19 @@ import numpy as np
 import pytest
 
 from shared import messages
-from shared.messages import ARRAY_EXTENSION, MAX_BYTES, MAX_SIDE, MAX_TEXT, Frame, Message, MessageError, decode, encode
+from shared.messages import (
+    ARRAY_EXTENSION,
+    MAX_BYTES,
+    MAX_SIDE,
+    MAX_TEXT,
+    Action,
+    Frame,
+    Message,
+    MessageError,
+    decode,
+    encode,
+    stamp_of,
+)
 from shared.topics import TOPICS
 from tests.samples import array_fields, sample
 
@@ -142,3 +154,16 @@ def test_array_headers_are_checked(data):
         decode(messages.Action, payload)
     with pytest.raises(MessageError):
         decode(messages.Action, wire(sample(messages.Action), translation_m=msgpack.ExtType(2, bytes(24))))
+
+
+@pytest.mark.parametrize("topic", TOPICS.values(), ids=lambda t: t.name)
+def test_the_stamp_is_that_of_the_whole_message(topic):
+    message = sample(topic.type, run="r" * 200, episode=2 ** 40, step=5, seq=0)
+    assert stamp_of(encode(message)) == (message.run, message.episode, message.step, message.seq)
+
+
+@pytest.mark.parametrize("payload", [b"", b"\xc1", b"\x80", encode(sample(Action))[:20],
+                                     encode(sample(Action)).replace(b"\xa4step\x03", b"\xa4step\xc0")])
+def test_what_does_not_begin_with_a_stamp_is_refused(payload):
+    with pytest.raises(MessageError, match="stamp"):
+        stamp_of(payload)

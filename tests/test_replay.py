@@ -151,14 +151,14 @@ def test_differences_name_the_field_the_place_and_both_values():
 def test_a_comparison_waits_for_both_and_tells_what_is_alone():
     comparison, action = Comparison(), sample(ACTION.type, step=1)
     later = sample(ACTION.type, step=2)
-    comparison.replayed(ACTION, None, action, encode(action))
-    comparison.recorded(ACTION, None, later, encode(later))
+    comparison.replayed(ACTION, None, encode(action))
+    comparison.recorded(ACTION, None, encode(later))
     assert not comparison.equal
-    comparison.recorded(ACTION, None, action, encode(action))
+    comparison.recorded(ACTION, None, encode(action))
     assert (comparison.compared, comparison.unequal) == (1, 0)
     assert comparison.only_recorded == [("action", None, 3, 2)]
     turned = dataclasses.replace(later, arrived=False)
-    found = comparison.replayed(ACTION, None, turned, encode(turned))
+    found = comparison.replayed(ACTION, None, encode(turned))
     assert [(d.field, d.recorded, d.replayed, d.tolerated) for d in found] == [("arrived", "True", "False", False)]
     assert (comparison.beyond, comparison.only_recorded, comparison.equal) == (1, [], False)
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Self
 
 from shared.errors import SaccadeError
-from shared.messages import Message, MessageError, decode
+from shared.messages import MessageError, Stamp, stamp_of
 from shared.reading import Recorded, RunReader
 from shared.topics import Topic
 
@@ -33,7 +33,7 @@ class Selection:
     start_step: int = 0
     end_step: int | None = None
 
-    def __contains__(self, told: tuple[Topic, Message]) -> bool:
+    def __contains__(self, told: tuple[Topic, Stamp]) -> bool:
         topic, message = told
         return (topic in self.topics and self.episode in (None, message.episode)
                 and (self.start_step <= message.step or topic.latched)
@@ -50,7 +50,7 @@ def steps_between(log: Path, clock: Topic, start_s: float | None, end_s: float |
         at_s = (entry.log_time_ns - begin_ns) / 1e9
         if entry.topic == clock and (start_s is None or at_s >= start_s) and (end_s is None or at_s <= end_s):
             with contextlib.suppress(MessageError):
-                message = decode(clock.type, entry.payload)
+                message = stamp_of(entry.payload)
                 if episode in (None, message.episode):
                     found.append((message.episode, message.step))
     episodes = sorted({at[0] for at in found})
@@ -105,7 +105,8 @@ class Keys:
     def pressed(self, wait_s: float = 0.0) -> str | None:
         """The next key within so many seconds."""
         if self.ended:
-            time.sleep(wait_s)
+            if wait_s > 0:
+                time.sleep(wait_s)
             return None
         if not select.select([sys.stdin], [], [], wait_s)[0]:
             return None
@@ -115,16 +116,16 @@ class Keys:
 
 
 def play(entries: Iterator[Recorded], selection: Selection, pace: Pace, keys: Keys, *, one_by_one: bool = False,
-         may_go_on: Callable[[Message], bool] = lambda _message: True,
-         say: Callable[[str], None] = lambda _text: None) -> Iterator[tuple[Recorded, Message]]:
+         may_go_on: Callable[[Stamp], bool] = lambda _stamp: True,
+         say: Callable[[str], None] = lambda _text: None) -> Iterator[tuple[Recorded, Stamp]]:
     """The selected messages when they are due. Space pauses and goes on, q ends; `one_by_one` each key press gives one
-    message. `may_go_on(message)` holds the log back while those it is played to are too far behind."""
+    message. `may_go_on(stamp)` holds the log back while those it is played to are too far behind."""
     for entry in entries:
         try:
-            message = decode(entry.topic.type, entry.payload)
+            stamp = stamp_of(entry.payload)
         except MessageError:
             continue
-        if (entry.topic, message) not in selection:
+        if (entry.topic, stamp) not in selection:
             continue
         if one_by_one:
             while not keys.ended and (key := keys.pressed(POLL_S)) is None:
@@ -133,9 +134,9 @@ def play(entries: Iterator[Recorded], selection: Selection, pace: Pace, keys: Ke
                 return
         elif not _wait(pace, entry, keys, say):
             return
-        while not may_go_on(message):
+        while not may_go_on(stamp):
             time.sleep(POLL_S / 10)
-        yield entry, message
+        yield entry, stamp
 
 
 def _wait(pace: Pace, entry: Recorded, keys: Keys, say: Callable[[str], None]) -> bool:
