@@ -57,7 +57,7 @@ class Recorder:
 
     def __init__(self, bus: Bus, folder: Path, config: Config) -> None:
         self.health, self._bus, self._run = Health(NAME), bus, config.run or folder.name
-        self._sequences = Sequences(from_start=True)
+        self._sequences = Sequences(from_start=True, cut=config.bus.first_step > 0)
         self._last: dict[tuple[str, str | None], tuple[int, int]] = {}  # of each key: episode and step
         self._asked_s, self._ask_again_s = 0.0, ASKED_AGAIN_S
         self.log = self._open(folder / LOG_NAME, config)
