@@ -64,9 +64,11 @@ class Supervisor:
 
     @property
     def settled(self) -> bool:
-        """Whether all services are up, and the last of those that died has been back for a while."""
+        """Whether all services are up and heard, and the last of those that died has been back for a while."""
+        now_s = time.monotonic()
         last_s = max((past[-1] for past in self._restarts.values() if past), default=-SETTLED_S)
-        return (time.monotonic() - last_s >= SETTLED_S and self._up == set(self._children)
+        return (now_s - last_s >= SETTLED_S and self._up == set(self._children)
+                and all(now_s - at_s < HUNG_S for at_s in self._heard_s.values())
                 and all(child.poll() is None for child in self._children.values()))
 
     def heard(self, name: str, state: str) -> None:
