@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from deploy.logs.cli import app as logs
+from deploy.options import configured, numbers, parse_value, split_names
 from deploy.threads import prefer_one_thread
 from shared.errors import SaccadeError
 
@@ -42,6 +43,13 @@ def run(*, objects: Objects = None, names: Names = None, scenes: ScenesFile = No
         bus: Annotated[Literal["zenoh", "local"] | None, typer.Option(
             help="services as processes on Zenoh, or all within this one [default: zenoh]")] = None,
         agent: Annotated[str, typer.Option(help="which agent")] = "sceneccn", weights: WeightsFolder = None,
+        world: Annotated[str, typer.Option(help="simulator, or camera: a real one")] = "simulator",
+        source: Annotated[str | None, typer.Option(
+            help="of a camera's images: a folder, a video file, or a webcam: webcam:0")] = None,
+        poses: Annotated[Path | None, typer.Option(help="where the camera was: JSON lines or TUM")] = None,
+        intrinsics: Annotated[str | None, typer.Option(help="of its images, in pixels", metavar="fx,fy,cx,cy")] = None,
+        rate: Annotated[float | None, typer.Option(help="images a second of a folder or webcam [default: 10]")] = None,
+        loop: Annotated[bool, typer.Option("--loop", help="from the first image again after the last")] = False,
         config: ConfigFile = None, values: Values = None,
         plain: Annotated[bool, typer.Option("--plain", help="lines instead of the live display")] = False) -> None:
     """Run the agent and log everything: run.mcap, config.json, picture.png."""
@@ -50,8 +58,9 @@ def run(*, objects: Objects = None, names: Names = None, scenes: ScenesFile = No
     given = {"scene.objects": objects, "scene.names": split_names(names), "scene.file": scenes, "scene.scene": scene,
              "seed": seed, "scene.count": count, "scene.n_objects": n_objects, "scene.yaw": yaw,
              "scene.goal_image": goal, "scene.explore": explore or None, "bus.kind": bus,
-             "perception.weights": weights}
-    run_agent(configured(config, given, values), agent=agent, out=out, plain=plain)
+             "perception.weights": weights, "camera.source": source, "camera.poses": poses,
+             "camera.intrinsics_px": numbers(intrinsics), "camera.rate_hz": rate, "camera.loop": loop or None}
+    run_agent(configured(config, given, values), agent=agent, out=out, plain=plain, world=world)
 
 
 @app.command()
@@ -234,32 +243,6 @@ def hz(key: Key, log: LogFile = None, count: Count = None, endpoint: Endpoint = 
     from deploy.hz import hz as show_rates
 
     show_rates(key, log=log, count=count, endpoint=endpoint, run=run)
-
-
-def configured(path: Path | None, given: dict[str, Any], values: list[str] | None) -> Any:
-    """The configuration: the file's, then the options that were given, then `--set`."""
-    from shared.config import load
-
-    options = {key: value for key, value in given.items() if value is not None}
-    return load(path).with_values(options | dict(parse_value(text) for text in values or ()))
-
-
-def parse_value(text: str) -> tuple[str, Any]:
-    """KEY=VALUE as (key, value): JSON where it is JSON, else text."""
-    from json import loads
-
-    key, equals, value = text.partition("=")
-    if not equals or not key:
-        raise SaccadeError(f"--set {text!r}: write KEY=VALUE, such as planner.step_m=0.03")
-    try:
-        return key, loads(value)
-    except ValueError:
-        return key, value
-
-
-def split_names(names: str | None) -> list[str] | None:
-    """The objects in a,b."""
-    return None if names is None else [name.strip() for name in names.split(",") if name.strip()]
 
 
 def wide(console: Any) -> Any:

@@ -10,32 +10,40 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from shared.loop import WAITS
 from shared.messages import Belief, Message, Plan, Result, Status, Truth
-from shared.topics import BELIEF, PLAN, RESULT, STATUS, TRUTH, Topic
+from shared.process import REFUSED
+from shared.topics import BELIEF, FRAME, PLAN, RESULT, STATUS, TRUTH, Topic
 
 LINE_EVERY = 10  # steps, in plain mode
 PER_SECOND = 8
 
 
 class Progress:
-    """What the messages of a run have told so far. `judged`: the truth knows the goal's view, so distances tell."""
+    """What the messages of a run have told so far. `judged`: the truth knows the goal's view, so distances tell. `at`:
+    episode and step of the newest view; `declared`: the plan by which the agent first said that it is there."""
 
     def __init__(self, *, judged: bool = True) -> None:
         self.judged = judged
+        self.at: tuple[int, int] | None = None
         self.truth: Truth | None = None
         self.plan: Plan | None = None
+        self.declared: Plan | None = None
         self.beliefs: dict[str, Belief] = {}
         self.statuses: dict[str, Status] = {}
         self.results: list[Result] = []
 
     def take(self, topic: Topic, part: str | None, message: Message) -> None:
         """Any message; those of an earlier episode are forgotten."""
+        if topic in (FRAME, TRUTH):
+            if self.at is not None and message.episode != self.at[0]:
+                self.plan, self.declared, self.beliefs = None, None, {}
+            self.at = message.episode, message.step
         if topic == TRUTH:
-            if self.truth is not None and message.episode != self.truth.episode:
-                self.plan, self.beliefs = None, {}
             self.truth = message
         elif topic == PLAN:
             self.plan = message
+            self.declared = self.declared or (message if message.arrived else None)
         elif topic == BELIEF:
             self.beliefs[part] = message
         elif topic == STATUS:
@@ -65,10 +73,10 @@ def spread_cm(belief: Belief) -> float:
 
 def line(progress: Progress) -> str:
     """The state of a run in one line."""
-    truth, plan = progress.truth, progress.plan
-    if truth is None:
+    plan = progress.plan
+    if progress.at is None:
         return "starting"
-    parts = [f"episode {truth.episode} step {truth.step}"]
+    parts = ["episode {} step {}".format(*progress.at)]
     if progress.judged:
         parts.append(f"goal {_metres(progress.distance_m)} away")
     if plan is not None:
@@ -83,18 +91,19 @@ def line(progress: Progress) -> str:
 
 def panel(progress: Progress) -> RenderableType:
     """The state of a run for the live display."""
-    truth = progress.truth
-    if truth is None:
+    if progress.at is None:
         waiting = sorted(f"{name} {status.state}" for name, status in progress.statuses.items())
         return Text("starting: " + ", ".join(waiting or ["services"]))
-    head = Text(f"episode {truth.episode}  step {truth.step}  scene {truth.scene}", style="bold")
+    scene = f"  scene {progress.truth.scene}" if progress.truth else ""
+    head = Text("episode {}  step {}".format(*progress.at) + scene, style="bold")
     return Group(head, _plan_table(progress), _belief_table(progress), _status_line(progress))
 
 
 def _plan_table(progress: Progress) -> Table:
     table = Table(show_header=False, box=None, padding=(0, 2))
-    table.add_row("distance to the goal", f"{_metres(progress.distance_m)} in truth",
-                  f"{_metres(progress.believed_distance_m)} as believed")
+    if progress.truth is not None or progress.believed_distance_m is not None:
+        table.add_row("distance to the goal", f"{_metres(progress.distance_m)} in truth",
+                      f"{_metres(progress.believed_distance_m)} as believed")
     if (plan := progress.plan) is not None:
         x, y, z = plan.viewpoint[:3, 3]
         table.add_row("viewpoint", f"({x:.2f}, {y:.2f}, {z:.2f}) m", f"{plan.mode} {plan.target}".strip())
@@ -117,8 +126,8 @@ def _belief_table(progress: Progress) -> RenderableType:
 
 
 def _status_line(progress: Progress) -> Text:
-    busy = [f"{name} {status.milliseconds:.0f} ms" for name, status in sorted(progress.statuses.items())
-            if status.milliseconds > 0]
+    busy = [f"{name} {status.milliseconds:.0f} ms" + (f" ({status.skipped} skipped)" if status.skipped else "")
+            for name, status in sorted(progress.statuses.items()) if status.milliseconds > 0]
     notes = [f"{name}: {status.note}" for name, status in sorted(progress.statuses.items())
              if status.refused or status.state in ("failed", "not recording")]
     return Text("  ".join(busy) + "".join(f"\n{note}" for note in notes), style="dim")
@@ -129,10 +138,12 @@ def _metres(distance_m: float | None) -> str:
 
 
 class Display:
-    """Shows a run's messages on a console; a context manager. Plain where asked for and where nobody sits before it."""
+    """Shows a run's messages on a console; a context manager. Plain where asked for and where nobody sits before it.
+    `camera`: the name of the source if it is a real camera, which knows no truth and has notes for the user."""
 
-    def __init__(self, console: Console, *, plain: bool, judged: bool = True) -> None:
+    def __init__(self, console: Console, *, plain: bool, judged: bool = True, camera: str | None = None) -> None:
         self.progress, self.console = Progress(judged=judged), console
+        self._camera, self._told = camera, set()
         self.plain = plain or not console.is_terminal
         self._live = Live(get_renderable=lambda: panel(self.progress), console=console, transient=True,
                           refresh_per_second=PER_SECOND)
@@ -148,11 +159,20 @@ class Display:
             self._live.stop()
 
     def say(self, text: str) -> None:
-        """A line that stays: what befell a service."""
+        """A line that stays: what befell a service, what a camera assumes."""
         self.console.print(text, markup=False, highlight=False, soft_wrap=True)
 
     def take(self, topic: Topic, part: str | None, message: Message) -> None:
         """To be called with every message of the run."""
         self.progress.take(topic, part, message)
-        if self.plain and topic == TRUTH and message.step % LINE_EVERY == 0:
+        if topic == STATUS and part == self._camera:
+            self.note(message.note)
+        if self.plain and topic == (FRAME if self._camera else TRUTH) and message.step % LINE_EVERY == 0:
             self.console.print(line(self.progress), markup=False, highlight=False, soft_wrap=True)
+
+    def note(self, text: str) -> None:
+        """Says the lines of a camera's notes that are new."""
+        for line in text.splitlines():
+            if line not in self._told and not line.startswith((WAITS, REFUSED)):
+                self._told.add(line)
+                self.say(f"{self._camera}: {line}")

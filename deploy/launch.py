@@ -20,22 +20,25 @@ from shared.errors import SaccadeError
 from shared.loop import READY_STATES
 from shared.messages import Message, MessageError, Result, decode
 from shared.sequences import Sequences
-from shared.topics import RESULT, STATUS, Topic
+from shared.topics import PLAN, RESULT, STATUS, Topic
 
 OnMessage = Callable[[Topic, str | None, Message], None]
 LOG_NAME = "run.mcap"
 READY_S = 120.0  # loading weights on a busy machine takes its time
 POLL_S = 0.2
 QUIET_S = 2.0  # without news a result is asked for: it may have been published while the router was away
+WORKED_OFF_S = 10.0  # without news after the last frame, where nobody judges: its plan will not come any more
+JUDGE = "evaluator"
 
 # The router, then the others in the order of the data.
 ROUTER, *SERVICES = PROCESSES = tuple(Process(name, f"services.{name}") for name in (
-    "router", "simulator", "perception", "belief", "planner", "evaluator", "recorder"))
+    "router", "simulator", "perception", "belief", "planner", JUDGE, "recorder"))
 
 
 def launch(config: Config, run_dir: Path, on_message: OnMessage | None = None,
            processes: Sequence[Process] = PROCESSES, say: Callable[[str], None] | None = None) -> list[Result]:
-    """Runs all episodes, one process per service, and returns their results in order; the log is `run_dir`/run.mcap.
+    """Runs all episodes, one process per service, and returns their results in order, none where nobody judges; the log
+    is `run_dir`/run.mcap. A run ends when its source has finished and what it sent has been worked off.
 
     `on_message(topic, part, message)` sees every valid message once, on the caller's thread; `say(text)` is told of
     services that died and were started again, and of those that hang. The first process is the router, the second the
@@ -43,7 +46,7 @@ def launch(config: Config, run_dir: Path, on_message: OnMessage | None = None,
     within READY_S.
     """
     config = resolve(config, processes)
-    with running(config, run_dir, processes, None if on_message else (STATUS, RESULT), say) as graph:
+    with running(config, run_dir, processes, None if on_message else (STATUS, PLAN, RESULT), say) as graph:
         results = _follow(graph, processes, on_message)
         graph.supervisor.stop()
         _drain(graph.messages, on_message)
@@ -135,26 +138,55 @@ def _await_router(messages: Iterator, router: Process) -> None:
 
 
 def _follow(graph: Graph, processes: Sequence[Process], on_message: OnMessage | None) -> list[Result]:
-    results: dict[int, Result] = {}
     starting = {process.name for process in processes[1:]}
-    episodes, deadline_s = None, time.monotonic() + READY_S
+    course = _Course(processes[1].name, judged=JUDGE in starting)
+    over_s, deadline_s = None, time.monotonic() + READY_S
     for item in graph.messages:
         if starting and time.monotonic() > deadline_s:
             raise SaccadeError(f"{', '.join(sorted(starting))}: not ready after {READY_S:.0f} s; see {LOGS_NAME}/")
-        if episodes is not None and len(results) >= episodes and graph.supervisor.settled:
+        over_s = (over_s or time.monotonic()) if course.over else None
+        if over_s is not None and graph.supervisor.settled(over_s):
             break
         if item is None:
             continue
         topic, part, message = item
         if on_message is not None:
             on_message(topic, part, message)
-        if topic == RESULT:
-            results[message.episode] = message
-        elif topic == STATUS and message.state in READY_STATES:
+        course.take(topic, part, message)
+        if topic == STATUS and message.state in READY_STATES:
             starting.discard(part)
-        elif topic == STATUS and part == processes[1].name and message.state == "finished":
-            episodes = message.episode + 1
-    return [results[episode] for episode in sorted(results)]
+    return [course.results[episode] for episode in sorted(course.results)]
+
+
+class _Course:
+    """How far a run has come."""
+
+    def __init__(self, source: str, *, judged: bool) -> None:
+        self.results: dict[int, Result] = {}
+        self._source, self._judged = source, judged
+        self._end: tuple[int, int] | None = None  # episode and step that the source published last
+        self._planned, self._news_s = (-1, -1), time.monotonic()
+
+    def take(self, topic: Topic, part: str | None, message: Message) -> None:
+        """Any message."""
+        if topic.in_step:
+            self._news_s = time.monotonic()
+        if topic == RESULT:
+            self.results[message.episode] = message
+        elif topic == PLAN:
+            self._planned = max(self._planned, (message.episode, message.step))
+        elif topic == STATUS and part == self._source and message.state == "finished":
+            self._end = (message.episode, message.step)
+
+    @property
+    def over(self) -> bool:
+        """Whether the source has finished and every episode has its result; where nobody judges, the last frame its
+        plan."""
+        if self._end is None:
+            return False
+        if self._judged:
+            return len(self.results) > self._end[0]
+        return self._planned >= self._end or time.monotonic() - self._news_s > WORKED_OFF_S
 
 
 def _drain(messages: Iterator, on_message: OnMessage | None) -> None:

@@ -147,6 +147,8 @@ def _from_above(axes: Axes, story: Story) -> None:
             axes.plot(*story.truth.goal_world_from_camera[:2, 3], "*", color="black", markersize=13,
                       label="goal's view", linestyle="none", zorder=4)
     way(axes, np.array(story.path_m))
+    if (reach := 1.05 * float(np.abs(np.array(story.path_m)[:, :2]).max())) > SHOWN_M:  # a real camera's
+        axes.set(xlim=(-reach, reach), ylim=(-reach, reach))
     axes.legend(loc="center left", bbox_to_anchor=(1.02, 0.5), fontsize=8, frameon=False)
 
 
@@ -184,6 +186,8 @@ def way(axes: Axes, path_m: NDArray[np.float64]) -> None:
 
 
 def _title(story: Story) -> str:
+    if story.truth is None:
+        return f"a real camera: {len(story.path_m)} views"
     if story.result is None:
         return f"episode {story.episode}: cut short after {len(story.path_m)} views"
     result = story.result

@@ -1,4 +1,5 @@
-"""Which cores make an agent, by name; the processes of a run and the pairs of an in-process run derive from it."""
+"""Which cores make an agent and a world, by name; the processes of a run and the pairs of an in-process run derive from
+it."""
 
 from __future__ import annotations
 
@@ -6,21 +7,39 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
 
-from deploy.launch import PROCESSES
+from deploy.launch import JUDGE
 from deploy.supervisor import Process
 from deploy.threads import limit_torch
 from shared.config import Config
 from shared.errors import SaccadeError
 from shared.service import Core, Service
+from shared.topics import TRUTH
 
 Pair = tuple[Service, Core]
 
-ROUTER, SOURCE, JUDGE, RECORDER = "router", "simulator", "evaluator", "recorder"
+ROUTER, RECORDER = "router", "recorder"
+
+
+@dataclass(frozen=True)
+class World:
+    """Where images come from and, maybe, actions go: the service `source`. `judges` hear its truth, where it has one;
+    one that is `live` waits for nobody."""
+
+    source: str
+    judges: tuple[str, ...] = ()
+    live: bool = False
+
+
+WORLDS = {
+    "simulator": World("simulator", judges=(JUDGE,)),
+    "camera": World("camera", live=True),
+}
+DEFAULT_WORLD = "simulator"
 
 
 @dataclass(frozen=True)
 class Agent:
-    """`services` are processes of their own in deploy/launch.py; `cores` are modules that run within one alone."""
+    """`services` are processes of their own; `cores` are modules that run within one alone."""
 
     services: tuple[str, ...] = ()
     cores: tuple[str, ...] = ()
@@ -45,28 +64,42 @@ def agent_of(name: str) -> Agent:
     return AGENTS[name]
 
 
+def world_of(name: str) -> World:
+    """The world of that name; raises SaccadeError for an unknown one."""
+    if name not in WORLDS:
+        raise SaccadeError(f"world {name!r} is unknown: choose from {', '.join(WORLDS)}")
+    return WORLDS[name]
+
+
 def agent_pairs(agent: str, config: Config) -> list[Pair]:
     """Declarations and cores of an agent, built for a configuration whose objects are named."""
     return [_pair(module, config) for module in agent_of(agent).modules]
 
 
-def local_pairs(agent: str, config: Config) -> list[Pair]:
-    """Everything that an in-process run needs: the simulator, the agent, the evaluator.
+def local_pairs(agent: str, config: Config, world: str = DEFAULT_WORLD) -> list[Pair]:
+    """Everything that an in-process run needs: the source, the agent, who judges it. Raises SaccadeError for an agent
+    that must be told a truth which the world does not know.
 
     Limits torch's threads as the launcher does for its processes: else the bytes would not be those of the bus.
     """
     limit_torch()
-    world, judge = (_pair(f"services.{name}.core", config) for name in (SOURCE, JUDGE))
-    return [world, *agent_pairs(agent, config), judge]
+    chosen = world_of(world)
+    source, *judges = (_pair(f"services.{name}.core", config) for name in (chosen.source, *chosen.judges))
+    agents = agent_pairs(agent, config)
+    if TRUTH not in source[0].outputs and any(TRUTH in service.inputs for service, _ in agents):
+        raise SaccadeError(f"agent {agent!r} must be told the truth, which the world {world!r} does not know: choose "
+                           "another agent")
+    return [source, *agents, *judges]
 
 
-def agent_processes(agent: str) -> tuple[Process, ...]:
-    """The processes of a run on the bus. Raises SaccadeError for an agent that has none of its own."""
-    chosen = agent_of(agent)
+def agent_processes(agent: str, world: str = DEFAULT_WORLD) -> tuple[Process, ...]:
+    """The processes of a run on the bus, the router first and the source second. Raises SaccadeError for an agent that
+    has none of its own."""
+    chosen, place = agent_of(agent), world_of(world)
     if chosen.cores:
         raise SaccadeError(f"agent {agent!r} runs within one process only: add `--bus local`")
-    wanted = {ROUTER, SOURCE, *chosen.services, JUDGE, RECORDER}
-    return tuple(process for process in PROCESSES if process.name in wanted)
+    return tuple(Process(name, f"services.{name}")
+                 for name in (ROUTER, place.source, *chosen.services, *place.judges, RECORDER))
 
 
 def weight_hashes(agent: str, config: Config) -> dict[str, str]:

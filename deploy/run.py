@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import signal
 import sys
+import threading
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from rich.console import Console
 
-from deploy.display import Display, Progress, spread_cm
+from deploy.display import Display
+from deploy.ending import ending
 from deploy.launch import launch
-from deploy.registry import agent_of, agent_processes, local_pairs
+from deploy.registry import DEFAULT_WORLD, agent_of, agent_processes, local_pairs, world_of
 from deploy.supervisor import CONFIG_NAME
-from services.camera.sources import absolute
+from services.camera.core import build as build_camera
+from services.camera.sources import absolute, webcam_number
 from services.recorder.core import LOG_NAME, describe
 from services.simulator.core import names_in_use
 from shared.config import Config
@@ -26,24 +32,49 @@ PICTURE_NAME = "picture.png"
 MANIFEST_NAME = "manifest.json"
 
 
-def run(config: Config, *, agent: str, out: Path | None, plain: bool, console: Console | None = None) -> list[Result]:
-    """Runs all episodes of a configuration into a new folder; prints how they ended and where it is."""
-    console = console or Console()
-    config = resolve(config)
+def run(config: Config, *, agent: str, out: Path | None, plain: bool, console: Console | None = None,
+        world: str = DEFAULT_WORLD) -> list[Result]:
+    """Runs all episodes of a configuration into a new folder; prints how they ended and where it is. Ctrl-C is one of
+    the ends that the run of a real camera has."""
+    console, place = console or Console(), world_of(world)
+    config = resolve(in_world(config, world))
     require_weights(agent, config)
-    processes = agent_processes(agent) if config.bus.kind == "zenoh" else ()
+    processes = agent_processes(agent, world) if config.bus.kind == "zenoh" else ()
     folder = _new_folder(out or Path("runs") / f"{time.strftime('%Y%m%d-%H%M%S')}-{config.seed}")
     judged = not config.scene.explore and config.scene.goal_image is None
-    with Display(console, plain=plain, judged=judged) as display:
-        if processes:
-            results = launch(config, folder, display.take, processes, display.say)
-        else:
-            results = run_here(config, agent, folder, display)
-    for text in _ending(config, results, display.progress):
+    with Display(console, plain=plain, judged=judged, camera=place.source if place.live else None) as display:
+        try:
+            if processes:
+                results = launch(config, folder, display.take, processes, display.say)
+            else:
+                results = run_here(config, agent, folder, display, world)
+        except KeyboardInterrupt:
+            if not place.live or display.progress.at is None:
+                raise
+            results = []
+    for text in ending(config, results, display.progress):
         console.print(text, markup=False, highlight=False, soft_wrap=True)
     _draw(folder)
     console.print(f"log, configuration and picture are in {folder}", markup=False, highlight=False, soft_wrap=True)
     return results
+
+
+def in_world(config: Config, world: str) -> Config:
+    """The configuration as that world has it. Raises SaccadeError for one that it has no use for, and for a camera that
+    cannot be: before anything starts."""
+    scene, camera = config.scene, config.camera
+    if not world_of(world).live:
+        if camera.source is not None:
+            raise SaccadeError("camera.source is for a real camera: add `--world camera`")
+        return config
+    if scene.file or scene.scene or scene.n_objects or scene.count > 1:
+        raise SaccadeError(f"scenes are the simulator's: with `--world {world}` leave --scenes, --scene, --n-objects "
+                           "and --count out")
+    config = config.with_values({"scene.explore": scene.explore or scene.goal_image is None,
+                                 "bus.live": config.bus.kind == "zenoh"})
+    if camera.source is None or webcam_number(camera.source) is None:  # a webcam would be switched on and off
+        build_camera(config)
+    return config
 
 
 def resolve(config: Config) -> Config:
@@ -64,71 +95,62 @@ def require_weights(agent: str, config: Config) -> None:
         Weights(config.weights)
 
 
-def run_here(config: Config, agent: str, folder: Path, display: Display) -> list[Result]:
+def run_here(config: Config, agent: str, folder: Path, display: Display, world: str = DEFAULT_WORLD) -> list[Result]:
     """The run within this process, logged as on the bus. A log that can take no more does not stop it."""
-    pairs = local_pairs(agent, config)
+    pairs = local_pairs(agent, config, world)
+    source = pairs[0][1]
     folder.mkdir(parents=True, exist_ok=True)
     config.save(folder / CONFIG_NAME)
     log = RunLog(folder / LOG_NAME, world=config.bus.world, configuration=config.model_dump_json(indent=2),
                  metadata=describe(config, folder.name))
 
     def on_message(topic: Topic, part: str | None, message: Message, payload: bytes | None) -> None:
+        end_if_interrupted()
         try:
             log.write(topic, part, payload, sequence=message.seq)
         except RecordingStopped as error:  # once; what follows is not logged
             print(f"saccade: {error}", file=sys.stderr)
         display.take(topic, part, message)
 
-    try:
-        run_local(pairs, config.scene.names, folder.name, on_message=on_message, encoded=True)
-    finally:
-        log.close()
+    display.note("\n".join(getattr(source, "notes", ())))
+    with _interrupted_between_messages() as end_if_interrupted:
+        try:
+            run_local(pairs, config.scene.names, folder.name, on_message=on_message, encoded=True)
+        finally:
+            log.close()
+            if left_out := getattr(source, "skipped", 0):
+                display.note(f"{left_out} images without a pose were left out")
     return display.progress.results
+
+
+@contextmanager
+def _interrupted_between_messages() -> Iterator[Callable[[], None]]:
+    """Ctrl-C takes effect where what is yielded is called: within a write it would tear the log. A second one, at
+    once."""
+    interrupted = threading.Event()
+
+    def raise_if_interrupted() -> None:
+        if interrupted.is_set():
+            raise KeyboardInterrupt
+
+    def on_interrupt(_number: int, _frame: object) -> None:
+        raise_if_interrupted()
+        interrupted.set()
+
+    if threading.current_thread() is not threading.main_thread():
+        yield raise_if_interrupted
+        return
+    before = signal.signal(signal.SIGINT, on_interrupt)
+    try:
+        yield raise_if_interrupted
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _new_folder(folder: Path) -> Path:
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise SaccadeError(f"{folder} is there already: a run needs a new folder, give another --out")
     return folder
-
-
-def _ending(config: Config, results: list[Result], progress: Progress) -> list[str]:
-    lines = [_result_line(config, result) for result in results] + _doubts(config, progress)
-    if config.scene.explore:
-        found = [belief for _, belief in sorted(progress.beliefs.items()) if belief.presence > 0.5]
-        for belief in found:
-            where = ", ".join(f"{x:.3f}" for x in belief.mean_m)
-            lines.append(f"found {belief.object} at ({where}) m ± {spread_cm(belief):.1f} cm")
-    elif len(results) > 1 and config.scene.goal_image is None:
-        lines.append(f"reached {sum(r.success for r in results)} of {len(results)} goals")
-    return lines
-
-
-def _doubts(config: Config, progress: Progress) -> list[str]:
-    """What the agent itself says, after the last episode, of why there was nothing to reach."""
-    plan = progress.plan
-    if plan is None or config.scene.explore:
-        return []
-    if not plan.target:
-        return [f"the goal image shows none of the known objects (confidence {plan.goal_confidence:.2f}): the agent "
-                "explored instead"]
-    target = progress.beliefs.get(plan.target)
-    if target is not None and target.presence < 0.5:
-        return [f"{plan.target} was not found: believed not to be there (presence {target.presence:.2f})"]
-    return []
-
-
-def _result_line(config: Config, result: Result) -> str:
-    """How one episode ended; errors only where the goal's true view is known."""
-    if config.scene.explore:
-        return f"{result.scene}: explored for {result.steps} steps"
-    if config.scene.goal_image is not None:
-        said = f"says after {result.steps} steps that it is there" if result.declared else \
-            f"did not find the goal's view in {result.steps} steps"
-        return f"goal image {config.scene.goal_image.name}: the agent {said}"
-    reached = "reached the goal" if result.success else "did not reach the goal"
-    return (f"{result.scene}: {reached} in {result.steps} steps; errors: azimuth {result.azimuth_error_rad:.3f} rad, "
-            f"elevation {result.elevation_error_rad:.3f} rad, range {result.range_error_m:.3f} m")
 
 
 def _draw(folder: Path) -> None:

@@ -62,13 +62,12 @@ class Supervisor:
                 [sys.executable, "-m", process.module, "--config", str(self._run_dir / CONFIG_NAME)], env=environment,
                 stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, start_new_session=True)
 
-    @property
-    def settled(self) -> bool:
-        """Whether all services are up and heard, and the last of those that died has been back for a while."""
-        now_s = time.monotonic()
+    def settled(self, since_s: float) -> bool:
+        """Whether all services are up and were heard since that time, and the last of those that died has been back for
+        a while."""
         last_s = max((past[-1] for past in self._restarts.values() if past), default=-SETTLED_S)
-        return (now_s - last_s >= SETTLED_S and self._up == set(self._children)
-                and all(now_s - at_s < HUNG_S for at_s in self._heard_s.values())
+        return (time.monotonic() - last_s >= SETTLED_S and self._up == set(self._children)
+                and all(at_s > since_s for at_s in self._heard_s.values())
                 and all(child.poll() is None for child in self._children.values()))
 
     def heard(self, name: str, state: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
@@ -16,6 +17,7 @@ from shared.process import DRAIN_S, Health, Heartbeat, Inbox, run_process
 from shared.sequences import Sequences
 from shared.service import Core, Output, Service
 from shared.stepper import Stepper, settle
+from shared.ticker import Ticker
 from shared.topics import STATUS, Topic
 
 OnMessage = Callable[[Topic, str | None, Message, bytes | None], None]
@@ -30,7 +32,8 @@ def main(service: Service, build: Callable[[Config], Core], *, source: bool = Fa
     """A service's whole process: `--config RUN/config.json`, then messages in, messages out, until SIGTERM.
 
     `parts` are the objects' names, those of the configuration unless given. A `source` begins its episodes itself,
-    the first once every service in `bus.wait_for` is ready. Bad input ends the process with one line and code 2.
+    the first once every service in `bus.wait_for` is ready; one that goes by time publishes a frame a period. Bad
+    input ends the process with one line and code 2.
     """
 
     def work(config: Config, folder: Path, inbox: Inbox) -> None:
@@ -52,21 +55,24 @@ def serve(service: Service, core: Core, bus: Bus, parts: tuple[str, ...], *, run
     """Runs a core on a bus until `inbox` is stopped; returns what it counted.
 
     What was published before this service was there, or while it or the router was away, is asked for: at the start,
-    and whenever nothing comes. So a service that is started again folds the episode so far and goes on.
+    and whenever nothing comes. So a service that is started again folds the episode so far and goes on. `live`, it
+    goes on with the newest.
     """
     inbox = inbox or Inbox()
     stepper = Stepper(service, core, parts, source=source, live=live, first_step=first_step)
-    loop = _Loop(stepper, bus, run, wait_for if source else ())
+    loop = _Loop(stepper, bus, run, wait_for if source else (), live=live)
     bus.answer(service.outputs, loop.outbox.answer)
     bus.subscribe(loop.topics + ((STATUS,) if loop.awaited else ()), inbox.put)
     with Heartbeat(bus, loop.health, inbox.stop):
-        loop.health.say("ready", WAITS + ", ".join(sorted(loop.awaited)) if loop.awaited else "")
+        loop.health.say("ready", WAITS + ", ".join(sorted(loop.awaited)) if loop.awaited else loop.notes)
         loop.begin_if_due()
         loop.catch_up()
         news_s = time.monotonic()
-        for item in inbox.items(0.0 if source else DRAIN_S, tick_s=IDLE_S):
+        for item in inbox.items(0.0 if source else DRAIN_S, IDLE_S, lambda: loop.wait_s):
             if item is not None:
                 loop.handle(*item, more=live and inbox.waiting)
+            if not inbox.stopping.is_set():
+                loop.tick_if_due()
             if item is not None and item[0] != STATUS:
                 news_s = time.monotonic()
             elif time.monotonic() - news_s >= IDLE_S:
@@ -79,20 +85,28 @@ def serve(service: Service, core: Core, bus: Bus, parts: tuple[str, ...], *, run
 class _Loop:
     """What one service does with one message."""
 
-    def __init__(self, stepper: Stepper, bus: Bus, run: str, wait_for: tuple[str, ...]) -> None:
-        service = stepper.service
+    def __init__(self, stepper: Stepper, bus: Bus, run: str, wait_for: tuple[str, ...], *, live: bool) -> None:
+        service, core = stepper.service, stepper.core
         self.health, self.outbox, self.awaited = Health(service.name), Outbox(), set(wait_for)
         self.topics = service.inputs + ((service.closed_by,) if service.closed_by else ())
         self._source = stepper.episode_done  # between episodes from the start
         self._stepper, self._bus, self._run, self._service = stepper, bus, run, service
-        self._sequences = Sequences()
+        self.notes = "\n".join(getattr(core, "notes", ()))
+        self._ticker = Ticker(core.period_s) if stepper.timed else None
+        self._live, self._sequences = live, Sequences()
         self._next_episode, self._closed = 0, -1
+        self._end = core.episodes if self._source else 0
 
     def handle(self, topic: Topic, part: str | None, payload: bytes, *, more: bool = False) -> None:
-        """Takes a message; runs the core for every step that it completes, unless there are `more` to look at first."""
+        """Takes a message; runs the core for every complete step, unless there are `more` to look at first."""
         if topic == STATUS:
             self._note_status(part, payload)
             return
+        self._take(topic, part, payload)
+        while not more and self._step(topic, part, self._stepper.advance):
+            self.begin_if_due()
+
+    def _take(self, topic: Topic, part: str | None, payload: bytes) -> None:
         self.health.received += 1
         try:
             message = decode(topic.type, payload)
@@ -103,23 +117,36 @@ class _Loop:
             self._stepper.offer(topic, part, message)
         except MessageError as error:
             self.health.refuse(topic, part, error)
-            return
-        while not more and self._step(topic, part, self._stepper.advance):
-            self.begin_if_due()
 
     def begin_if_due(self) -> None:
         """Begins a source's next episode, if everyone is there and the one before it is over and closed."""
         while self._source and not self.awaited and self._stepper.episode_done and self._is_closed:
-            if self._next_episode >= self._stepper.core.episodes:
+            if self._next_episode >= self._end:
                 self.health.say("finished")
                 return
             episode, self._next_episode = self._next_episode, self._next_episode + 1
             self._step(None, None, lambda e=episode: self._stepper.begin(self._run, e))
+            if self._ticker:
+                self._ticker.start()
+
+    def tick_if_due(self) -> None:
+        """The next frame of a source that goes by time."""
+        if self._ticker and self._ticker.take():
+            self._step(None, None, self._stepper.tick)
+            if self._stepper.episode_done:
+                self._ticker.stop()
+                self.begin_if_due()
+
+    @property
+    def wait_s(self) -> float:
+        """Seconds until this service has something to do by itself."""
+        return self._ticker.wait_s if self._ticker else math.inf
 
     def catch_up(self) -> None:
-        """Asks for inputs that were published and have not come, until there are none that lead on."""
+        """Asks for inputs that were published and have not come, until there are none that lead on. Where nobody waits
+        what is past is past: only what holds for the whole episode is asked for."""
         latched = [topic for topic in self.topics if topic.latched and topic != self._service.closed_by]
-        others = [topic for topic in self.topics if topic not in latched]
+        others = [topic for topic in self.topics if topic not in latched and not self._live]
         while not self.awaited:
             wants = self._stepper.wants
             kept = self._bus.recall(latched, wants and (*wants[:2], 0)) + self._bus.recall(others, wants)
@@ -150,10 +177,12 @@ class _Loop:
         if part in self.awaited and status.state in READY_STATES:
             self.awaited.discard(part)
             if status.run == self._run:  # this source was here before: the others are in that episode already
-                self._next_episode = max(self._next_episode, status.episode)
+                past = 1 if self._ticker else 0  # what one that goes by time has shown does not come back
+                self._next_episode = max(self._next_episode, status.episode + past)
                 self._closed = self._next_episode - 1
+                self._end = self._stepper.core.episodes + past * self._next_episode
             if not self.awaited:
-                self.health.say(note="")
+                self.health.say(note=self.notes)
                 self.begin_if_due()
                 self.catch_up()
 
@@ -168,7 +197,7 @@ class _Loop:
             self.health.milliseconds = (time.perf_counter() - start) * 1e3
             self._publish(outputs)
             if self.health.note.startswith(WAITS):
-                self.health.say(note="")
+                self.health.say(note=self.notes)
         except MessageError as error:
             if topic is None:
                 name = self.health.service
@@ -177,7 +206,7 @@ class _Loop:
         finally:
             self.health.state = before
             self.health.at = self._stepper.at
-            self.health.skipped = self._stepper.skipped
+            self.health.skipped = self._stepper.skipped + getattr(self._stepper.core, "skipped", 0)
         return True
 
     def _publish(self, outputs: list[Output]) -> None:
@@ -199,7 +228,8 @@ def run_local(pairs: Sequence[tuple[Service, Core]], parts: tuple[str, ...], run
     """Runs the cores in this process: those episodes of the source (the core with `episodes`), in rising order; or all.
 
     `on_message(topic, part, message, payload)` sees every message in the order of publication; payload is its wire
-    bytes if `encoded`, else None, and messages pass as they are. `on_step(service, milliseconds)` is told what each
+    bytes if `encoded`, else None, and messages pass as they are. A source that goes by time is not hurried: its next
+    frame comes when the one before it has been worked off. `on_step(service, milliseconds)` is told what each
     step of a core took. Raises SaccadeError if a step lacks an input for good.
     """
     sources = [Stepper(s, c, parts, source=True) for s, c in pairs if hasattr(c, "episodes")]
@@ -209,7 +239,10 @@ def run_local(pairs: Sequence[tuple[Service, Core]], parts: tuple[str, ...], run
     steppers = [source if c is source.core else Stepper(s, c, parts) for s, c in pairs]
     for episode in range(source.core.episodes) if episodes is None else episodes:
         waiting = deque(source.begin(run_id, episode))
-        while waiting:
+        while waiting or (source.timed and not source.episode_done):
+            if not waiting:  # the frame before it has been worked off
+                waiting.extend(source.tick())
+                continue
             output = waiting.popleft()
             message = settle(output.message)
             if on_message is not None:

@@ -28,7 +28,8 @@ class Kept(NamedTuple):
 
 
 class Outbox:
-    """Keeps the newest `limit_bytes` of what was published. Safe between threads."""
+    """Keeps the newest `limit_bytes` of what was published, and what holds for the whole of the newest episode. Safe
+    between threads."""
 
     def __init__(self, limit_bytes: int = KEPT_BYTES) -> None:
         self._limit, self._held = limit_bytes, 0
@@ -41,8 +42,14 @@ class Outbox:
         with self._lock:
             self._kept.append(kept)
             self._held += len(payload)
-            while self._held > self._limit:
-                self._held -= len(self._kept.popleft().payload)
+            holding = []
+            while self._held > self._limit and self._kept:
+                old = self._kept.popleft()
+                if old.topic.latched and old.at[:2] == kept.at[:2]:
+                    holding.append(old)
+                else:
+                    self._held -= len(old.payload)
+            self._kept.extendleft(reversed(holding))
 
     def answer(self, topics: Iterable[Topic], since: Since | None, limit_bytes: int) -> list[Kept]:
         """What was published on these topics in the run of `since` from its episode and step on, oldest first, whole

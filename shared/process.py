@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import math
 import os
 import queue
 import signal
@@ -25,6 +26,8 @@ SHORTEST_S = 0.05  # between two statuses, however many messages are refused
 QUIET_S = 0.1  # a service told to stop first works off what is already on its way: until nothing came for so long,
 DRAIN_S = 1.0  # or for so long in all
 EXIT_ERROR = 2
+NOTE_LENGTH = 1000
+REFUSED = "refused: "
 STARTING = "starting"
 LAUNCHER_VARIABLE = "SACCADE_LAUNCHER"  # the launcher's process id: the service stops if that is no longer its parent
 
@@ -69,11 +72,12 @@ class Inbox:
         """Whether something is there to be taken."""
         return not self._queue.empty()
 
-    def items(self, drain_s: float = DRAIN_S, tick_s: float | None = None) -> Iterator[Item | None]:
+    def items(self, drain_s: float = DRAIN_S, tick_s: float | None = None,
+              wait_s: Callable[[], float] = lambda: math.inf) -> Iterator[Item | None]:
         """Every item up to `stop`, then what follows without a pause, for `drain_s` seconds at most. With `tick_s`
-        also None whenever nothing came for so long."""
+        also None whenever nothing came for so long, or for `wait_s()` where that is less."""
         while True:
-            item = self.get(tick_s)
+            item = self.get(None if tick_s is None else min(tick_s, wait_s()))
             if item is None and self.stopping.is_set():
                 break  # behind everything that came before `stop`, but for a tick at that very moment
             if item is not None or tick_s is not None:
@@ -102,13 +106,13 @@ class Health:
     def say(self, state: str | None = None, note: str | None = None) -> None:
         """Changes state or note, and has it published soon."""
         self.state = self.state if state is None else state
-        self.note = self.note if note is None else note[:500]
+        self.note = self.note if note is None else note[:NOTE_LENGTH]
         self.changed.set()
 
     def refuse(self, topic: Topic, part: str | None, reason: object) -> None:
         """Counts a message that was no good and says which field of it."""
         self.refused += 1
-        self.say(note=f"refused: {topic.name}{f'/{part}' if part else ''}: {reason}")
+        self.say(note=f"{REFUSED}{topic.name}{f'/{part}' if part else ''}: {reason}")
 
     def status(self, seq: int) -> Status:
         """The message for the bus."""

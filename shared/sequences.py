@@ -29,13 +29,16 @@ class Stamper:
 class Sequences:
     """Which messages of each key were there. What is missing may still come, out of its turn.
 
-    A status is not part of an episode: it counts from 0 in every process, and nobody can ask for it again.
+    A status is not part of an episode: it counts from 0 in every process, and nobody can ask for it again. Where nobody
+    waits, a service that was started again goes on with the newest step and counts anew: a number that was there
+    already, of a step that was not.
     """
 
     def __init__(self, *, from_start: bool = False, cut: bool = False) -> None:
         self._from_start = from_start  # whether this listens since before the first message
         self._cut = cut  # whether every episode may begin at any number
         self._next: dict[Key, dict[Episode, int]] = {}
+        self._last_step: dict[tuple[Key, Episode], int] = {}
         self._missing: dict[Key, set[tuple[str, int, int]]] = {}
 
     def take(self, topic: Topic, part: str | None, message: Message) -> int | None:
@@ -48,6 +51,10 @@ class Sequences:
         episodes = self._next.setdefault(key, {})
         first = 0 if (episodes or self._from_start) and not self._cut else seq
         due = episodes.get(episode, first)
+        last_step = self._last_step.get((key, episode), message.step)
+        self._last_step[key, episode] = max(last_step, message.step)
+        if seq < due and message.step > last_step:
+            due = 0
         if seq >= due:
             episodes[episode] = seq + 1
             if seq > due:

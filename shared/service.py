@@ -43,3 +43,14 @@ class Core(Protocol):
 
     def step(self, inputs: Inputs) -> Iterable[Output]:
         """All inputs of one step."""
+
+
+class TimedSource(Core, Protocol):
+    """A source that goes by time, not by actions: its episode ends when there is no next frame."""
+
+    period_s: float  # from one frame to the next
+    notes: tuple[str, ...]  # for the user, a line each
+    skipped: int  # images that it could not publish
+
+    def next_frame(self) -> Iterable[Output]:
+        """What it sees next; nothing when that was all."""

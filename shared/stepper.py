@@ -76,6 +76,17 @@ class Stepper:
         """Starts an episode of a source and returns its first outputs."""
         return self._emit(self._start((run, episode)))
 
+    def tick(self) -> list[Output]:
+        """The next frame of a source that goes by time; without one its episode is done."""
+        outputs = self._emit(self.core.next_frame())
+        self.episode_done |= not outputs
+        return outputs
+
+    @property
+    def timed(self) -> bool:
+        """Whether this is a source that goes by time."""
+        return self._source and hasattr(self.core, "next_frame")
+
     def advance(self) -> list[Output] | None:
         """Runs the core on the next complete step: its stamped outputs, or None if no step is complete."""
         while True:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -53,7 +54,7 @@ class Missing:
 
 def missing(path: Path) -> Missing:
     """Reads a log and reports gaps. The last step of an episode that is done needs no answer to its frame; of a log
-    that was cut out of another only its range is expected."""
+    that was cut out of another only its range is expected. Where nobody waited (`bus.live`) no step needs an answer."""
     report, reader, sequences = Missing(), RunReader(path), None
     steps: dict[tuple[str, int], dict[int, set[str]]] = {}
     done: set[tuple[str, int, int]] = set()
@@ -68,7 +69,8 @@ def missing(path: Path) -> Missing:
             steps.setdefault((message.run, message.episode), {}).setdefault(message.step, set()).add(key)
             if topic == TRUTH and message.done:
                 done.add((message.run, message.episode, message.step))
-    report.absent = _absent(steps, done, range_of(reader))
+    live = json.loads(reader.configuration or "{}").get("bus", {}).get("live", False)
+    report.absent = [] if live else _absent(steps, done, range_of(reader))
     if sequences is not None:
         report.lost = {TOPICS[name].key(reader.world, part): lost for (name, part), lost in sequences.missing.items()}
     report.refused, report.cut = reader.refused, reader.cut

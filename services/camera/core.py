@@ -24,9 +24,10 @@ WHOLE = 0.995  # of the field of view; what is less is said
 
 
 class Camera:
-    """One episode: the images of a source as the networks know them, with INTRINSICS_PX and their poses.
+    """The images of a source as the networks know them, with INTRINSICS_PX and their poses.
 
-    Whoever drives it asks for the next frame every `period_s` seconds. Images without a pose are `skipped`. With `loop`
+    They are one episode, the first; a camera that is started again in a run begins another one. Whoever drives it asks
+    for the next frame every `period_s` seconds. Images without a pose are `skipped`. With `loop`
     the source begins anew when it has ended. `goal_rgb` [480, 480, 3]; without it the agent explores. `notes`: what is
     assumed, a line each, for the user.
     """
@@ -37,13 +38,11 @@ class Camera:
                  goal_rgb: NDArray[np.uint8] | None = None, loop: bool = False, notes: tuple[str, ...] = ()):
         self.source, self.poses, self.virtual_camera = source, poses, virtual_camera
         self.goal_rgb, self.loop, self.notes = goal_rgb, loop, notes
-        self.period_s = source.period_s
+        self.period_s, self.skipped = source.period_s, 0
 
     def begin(self, run: str, episode: int) -> list[Output]:
         """The goal and the first frame. Raises SaccadeError where no image has a pose."""
-        if episode != 0:
-            raise SaccadeError(f"episode {episode} does not exist: a camera has one, counted from 0")
-        self._run, self._published, self.skipped = run, 0, 0
+        self._at, self._published, self.skipped = {"run": run, "episode": episode}, 0, 0
         self._first: SourceImage | None = None
         self._images = self._all_images()
         frame = self.next_frame()
@@ -51,7 +50,7 @@ class Camera:
             seen = f"{self.skipped} images of {self.source.name} ({self._first} to {self._last})"
             raise SaccadeError(f"none of the {seen} has a pose in {self.poses}: give poses by the images' names, "
                                "indices or times")
-        goal = Goal(run=run, episode=0, step=0, rgb=self.goal_rgb, intrinsics_px=np.array(INTRINSICS_PX))
+        goal = Goal(**self._at, step=0, rgb=self.goal_rgb, intrinsics_px=np.array(INTRINSICS_PX))
         return [Output(GOAL, goal), *frame]
 
     def next_frame(self) -> list[Output]:
@@ -61,7 +60,7 @@ class Camera:
             self._first, self._last = self._first or image, image
             world_from_camera = self.poses.of(image)
             if world_from_camera is not None:
-                frame = Frame(run=self._run, episode=0, step=self._published, rgb=self.virtual_camera.see(image.rgb),
+                frame = Frame(**self._at, step=self._published, rgb=self.virtual_camera.see(image.rgb),
                               intrinsics_px=np.array(INTRINSICS_PX), world_from_camera=world_from_camera)
                 self._published += 1
                 return [Output(FRAME, frame)]

@@ -25,6 +25,7 @@ DEFAULT_RATE_HZ = 10.0
 MAX_RATE_HZ = 1000.0  # beyond it a video's header says nothing
 WHOLE = 0.9  # share of the frames announced; some formats only estimate their number
 RELEASE_S = 1.0  # a webcam's thread is waited for so long
+SILENT_S = 5.0  # a webcam that gives no image for so long gives none any more
 
 
 @dataclass(frozen=True)
@@ -195,7 +196,9 @@ class Webcam:
         try:
             start = None
             for index in itertools.count():
-                item = newest.get()
+                item = None
+                with suppress(queue.Empty):
+                    item = newest.get(timeout=SILENT_S)
                 if item is None:
                     raise self._silent()
                 at, bgr = item
