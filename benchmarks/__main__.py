@@ -26,8 +26,9 @@ from services.planner.goal import Preference
 from shared.config import REPOSITORY
 from shared.generative_model import CROP_PX, Encoder, Stacked
 from shared.geometry import GRID_AZIMUTHS, GRID_ELEVATIONS, IMAGE_SIZE_PX, INTRINSICS_PX
-from shared.messages import Belief, Frame, decode, encode
+from shared.messages import Belief, Frame
 from shared.weights import Weights
+from shared.wire import decode, encode
 
 
 def milliseconds(work: Callable[[], object], repetitions: int = 9) -> float:

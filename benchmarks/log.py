@@ -17,10 +17,10 @@ from rich.console import Console
 from rich.table import Table
 
 from services.replayer.core import Keys, Pace, Selection, play
-from shared.messages import decode, encode
 from shared.reading import RunReader
 from shared.recording import RunLog
 from shared.topics import STATUS, TOPICS
+from shared.wire import decode, encode
 
 ROUNDS, LONGER = 7, 10
 

@@ -21,9 +21,9 @@ from deploy.registry import local_pairs
 from shared.config import Config
 from shared.errors import SaccadeError
 from shared.loop import run_local
-from shared.messages import encode
 from shared.reading import RunReader
 from shared.topics import ACTION, STATUS
+from shared.wire import encode
 
 EVERY_S = (4.0, 10.0)  # between two kills
 EPISODES = 6

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from deploy.tolerances import IGNORED, tolerance_of
-from shared.messages import Message, decode, stamp_of
+from shared.messages import Message
 from shared.topics import Topic
+from shared.wire import decode, stamp_of
 
 KEPT = 1_000  # differences that are told one by one
 

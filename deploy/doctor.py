@@ -20,8 +20,9 @@ from services.simulator.opengl import choose_backend
 from shared.bus import ZenohBus, free_endpoint
 from shared.config import REPOSITORY, Config, SceneConfig
 from shared.errors import SaccadeError
-from shared.messages import Status, encode
+from shared.messages import Status
 from shared.topics import STATUS
+from shared.wire import encode
 
 OLDEST_PYTHON = (3, 11)
 ANSWER_S = 10.0

@@ -15,7 +15,8 @@ import numpy as np
 
 from deploy.listen import Heard, Live, Logged, Wanted, live, until_interrupted
 from deploy.logs.source import log_of
-from shared.messages import Message, MessageError, decode
+from shared.messages import Message
+from shared.wire import MessageError, decode
 
 MOST_NUMBERS = 16  # of an array that is told in full
 HEADER = ("run", "episode", "step", "seq")

@@ -18,9 +18,10 @@ from shared.bus import Bus, ZenohBus, free_endpoint
 from shared.config import Config
 from shared.errors import SaccadeError
 from shared.loop import READY_STATES
-from shared.messages import Message, MessageError, Result, decode
+from shared.messages import Message, Result
 from shared.sequences import Sequences
 from shared.topics import PLAN, RESULT, STATUS, Topic
+from shared.wire import MessageError, decode
 
 OnMessage = Callable[[Topic, str | None, Message], None]
 LOG_NAME = "run.mcap"

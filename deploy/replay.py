@@ -22,13 +22,14 @@ from shared.bus import free_endpoint
 from shared.config import Config, validate
 from shared.errors import SaccadeError
 from shared.loop import READY_STATES
-from shared.messages import Message, MessageError, Stamp, Status, decode, encode, stamp_of
+from shared.messages import Message, Status
 from shared.outbox import Outbox
 from shared.reading import Recorded, RunReader
 from shared.recording import RunLog
 from shared.service import Output, Service
 from shared.stepper import Stepper, settle
 from shared.topics import STATUS, TOPICS, Topic
+from shared.wire import MessageError, Stamp, decode, encode, stamp_of
 
 REPLAYABLE = ("perception", "belief", "planner", "evaluator")
 WINDOW = 32  # steps that the log may be ahead of the slowest service

@@ -15,9 +15,9 @@ from collections.abc import Callable, Iterable
 from typing import Protocol
 
 from shared.errors import SaccadeError
-from shared.messages import MAX_BYTES, MessageError, decode
 from shared.outbox import PAGE_BYTES, Kept, Since
 from shared.topics import ROOT, Topic, parse_key
+from shared.wire import MAX_BYTES, MessageError, decode
 
 Deliver = Callable[[Topic, str | None, bytes], None]  # runs on the bus's thread: must only put its arguments somewhere
 Answer = Callable[[Iterable[Topic], Since | None, int], list[Kept]]

@@ -11,7 +11,7 @@ from pathlib import Path
 from shared.bus import Bus, ZenohBus
 from shared.config import Config
 from shared.errors import SaccadeError
-from shared.messages import Message, MessageError, decode, encode
+from shared.messages import Message
 from shared.outbox import Outbox
 from shared.process import DRAIN_S, Health, Heartbeat, Inbox, run_process
 from shared.sequences import Sequences
@@ -19,6 +19,7 @@ from shared.service import Core, Output, Service
 from shared.stepper import Stepper, settle
 from shared.ticker import Ticker
 from shared.topics import STATUS, Topic
+from shared.wire import MessageError, decode, encode
 
 OnMessage = Callable[[Topic, str | None, Message, bytes | None], None]
 OnStep = Callable[[str, float], None]

@@ -8,8 +8,9 @@ from collections import deque
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from shared.messages import Message, Stamp
+from shared.messages import Message
 from shared.topics import Topic
+from shared.wire import Stamp
 
 Since = tuple[str, int, int]  # run, episode, step
 

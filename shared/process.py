@@ -18,8 +18,9 @@ from pathlib import Path
 from shared.bus import Bus
 from shared.config import Config, load
 from shared.errors import SaccadeError
-from shared.messages import Status, encode
+from shared.messages import Status
 from shared.topics import STATUS, Topic
+from shared.wire import encode
 
 HEARTBEAT_S = 0.5
 SHORTEST_S = 0.05  # between two statuses, however many messages are refused

@@ -16,10 +16,11 @@ from mcap.writer import MCAP0_MAGIC
 from zstandard import ZstdError
 
 from shared.errors import SaccadeError
-from shared.messages import Message, MessageError, decode
+from shared.messages import Message
 from shared.migrations import OLDEST, Migration
 from shared.recording import CONFIGURATION, ENDED_EARLY, LOG
 from shared.topics import Topic, parse_key
+from shared.wire import MessageError, decode
 
 MAX_RECORD_BYTES = 512 * 1024 * 1024
 DAMAGE = (McapError, struct.error, ZstdError, ValueError, OverflowError, MemoryError)

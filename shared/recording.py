@@ -16,9 +16,10 @@ from mcap.records import DataEnd, Footer, Metadata
 from mcap.writer import MCAP0_MAGIC, Writer
 
 from shared.errors import SaccadeError
-from shared.messages import ARRAY_EXTENSION, ArraySpec, Message, field_types
+from shared.messages import ArraySpec, Message, field_types
 from shared.migrations import FORMAT
 from shared.topics import Topic
+from shared.wire import ARRAY_EXTENSION
 
 FLUSH_S = 0.4  # a chunk is closed this often: what a killed recorder may lose
 CONFIGURATION = "config.json"

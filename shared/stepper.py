@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 
 from shared.errors import SaccadeError
-from shared.messages import Message, MessageError
+from shared.messages import Message
 from shared.sequences import Stamper
 from shared.service import Core, Output, Service
 from shared.topics import TRUTH, Topic
+from shared.wire import MessageError
 
 MAX_PENDING = 256  # incomplete steps kept, so that a flood of stray messages cannot fill the memory
 

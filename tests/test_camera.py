@@ -13,8 +13,9 @@ from services.camera.sources import SourceImage
 from services.camera.virtual_camera import VirtualCamera
 from shared.config import Config
 from shared.geometry import INTRINSICS_PX, project
-from shared.messages import Action, Frame, decode, encode
+from shared.messages import Action, Frame
 from shared.task import start_pose
+from shared.wire import decode, encode
 from tests.fakes.camera import HERE, THERE, centroid, complaint, dots, folder_of, line, tum, written
 
 

@@ -10,7 +10,8 @@ import pytest
 
 from services.evaluator.core import Evaluator
 from shared.geometry import look_at
-from shared.messages import Truth, encode
+from shared.messages import Truth
+from shared.wire import encode
 
 TARGET = np.array([0.1, 0.0, 0.05])
 GOAL = look_at(TARGET + np.array([0.3, 0.0, 0.0]), TARGET)

@@ -18,9 +18,10 @@ from deploy.logs import tables
 from deploy.logs.export import export_foxglove, export_tables
 from deploy.logs.fields import kinds
 from shared.errors import SaccadeError
-from shared.messages import ArraySpec, encode, field_types
+from shared.messages import ArraySpec, field_types
 from shared.recording import RunLog
 from shared.topics import FRAME, PLAN, TOPICS
+from shared.wire import encode
 from tests.fakes.logs import CENTERS, SIZE, START_NS, of, story, write
 from tests.samples import sample
 

@@ -22,9 +22,9 @@ from deploy.listen import Heard, Live, Logged, Wanted, live, newest
 from shared.bus import ZenohBus, free_endpoint
 from shared.config import Config
 from shared.errors import SaccadeError
-from shared.messages import encode
 from shared.outbox import Outbox
 from shared.topics import ACTION, FRAME, GOAL, GOAL_PERCEPT, PERCEPT, TOPICS, TRUTH
+from shared.wire import encode
 from tests.fakes.logs import story, write
 from tests.samples import sample
 

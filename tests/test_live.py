@@ -16,7 +16,7 @@ from deploy.logs.check import missing
 from deploy.supervisor import Process
 from shared.bus import LocalBus
 from shared.loop import run_local, serve
-from shared.messages import MessageError, Status, decode, encode
+from shared.messages import Status
 from shared.outbox import Outbox
 from shared.process import Inbox
 from shared.reading import RunReader
@@ -25,6 +25,7 @@ from shared.service import Service
 from shared.stepper import Stepper
 from shared.ticker import Ticker
 from shared.topics import ACTION, FRAME, GOAL, PERCEPT, PLAN, STATUS
+from shared.wire import MessageError, decode, encode
 from tests.fakes.launch import PARTS, configuration
 from tests.fakes.services import BELIEVER, PERCEPTION, PLANNER, FakeBelief, FakePerception, FakePlanner
 from tests.fakes.timed import TIMED, FakeCamera

@@ -10,11 +10,11 @@ import deploy.cli as cli
 from deploy.logs.check import abbreviated, missing
 from deploy.logs.cut import CUT, Range, cut, range_of
 from shared.errors import SaccadeError
-from shared.messages import encode
 from shared.migrations import FORMAT
 from shared.reading import RunReader
 from shared.recording import RunLog
 from shared.topics import ACTION, FRAME, GOAL, PERCEPT, RESULT, STATUS, TRUTH
+from shared.wire import encode
 from tests.samples import sample
 
 STEPS = 6

@@ -16,10 +16,11 @@ from shared.bus import LocalBus, ZenohBus, free_endpoint
 from shared.config import Config
 from shared.errors import SaccadeError
 from shared.loop import main, run_local, serve
-from shared.messages import MAX_BYTES, Status, decode, encode
+from shared.messages import Status
 from shared.process import Inbox
 from shared.service import Output, Service
 from shared.topics import ACTION, BELIEF, FRAME, GOAL_PERCEPT, PERCEPT, PLAN, RESULT, STATUS, TOPICS, TRUTH
+from shared.wire import MAX_BYTES, decode, encode
 from tests.fakes.services import SERVICES, FakePlanner, pairs
 from tests.samples import array_fields, sample
 

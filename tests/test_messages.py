@@ -8,21 +8,19 @@ import msgpack
 import numpy as np
 import pytest
 
-from shared import messages
-from shared.messages import (
+from shared.messages import Action, Frame, Message, field_types
+from shared.topics import TOPICS
+from shared.wire import (
     ARRAY_EXTENSION,
     MAX_BYTES,
     MAX_SIDE,
     MAX_TEXT,
-    Action,
-    Frame,
-    Message,
     MessageError,
+    _pack_array,
     decode,
     encode,
     stamp_of,
 )
-from shared.topics import TOPICS
 from tests.samples import array_fields, sample
 
 TYPES = sorted({topic.type for topic in TOPICS.values()}, key=lambda t: t.__name__)
@@ -48,7 +46,7 @@ def wire(message: Message, **changes) -> bytes:
     """The message's map with some entries replaced (None of them checked) or, where the value is `...`, left out."""
     fields = {"type": type(message).__name__, "version": message.VERSION}
     fields |= {f.name: getattr(message, f.name) for f in dataclasses.fields(message)} | changes
-    return msgpack.packb({k: v for k, v in fields.items() if v is not ...}, default=messages._pack_array)
+    return msgpack.packb({k: v for k, v in fields.items() if v is not ...}, default=_pack_array)
 
 
 @every_type
@@ -60,7 +58,7 @@ def test_round_trip(kind):
 
 @every_type
 def test_optional_fields_may_be_absent(kind):
-    optional = [n for n, h in messages.field_types(kind).items() if type(None) in getattr(h, "__args__", ())]
+    optional = [n for n, h in field_types(kind).items() if type(None) in getattr(h, "__args__", ())]
     original = sample(kind, **dict.fromkeys(optional))
     assert equal(decode(kind, encode(original)), original)
 
@@ -68,7 +66,7 @@ def test_optional_fields_may_be_absent(kind):
 @every_type
 def test_fields_missing_unknown_or_of_another_type_are_refused(kind):
     message = sample(kind)
-    for name in messages.field_types(kind):
+    for name in field_types(kind):
         with pytest.raises(MessageError, match=f"{name}: missing"):
             decode(kind, wire(message, **{name: ...}))
         with pytest.raises(MessageError, match=f"{name}: "):
@@ -105,7 +103,7 @@ def test_oversized_payloads_and_texts_are_refused(kind):
 @every_type
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), True, "1"])
 def test_numbers_are_finite(kind, value):
-    for name, hint in messages.field_types(kind).items():
+    for name, hint in field_types(kind).items():
         if hint is float:
             with pytest.raises(MessageError, match=name):
                 decode(kind, wire(sample(kind), **{name: value}))
@@ -149,11 +147,11 @@ def test_dimensions_of_the_same_name_must_agree():
     msgpack.packb(["f8", [2 ** 40, 2 ** 40]]), msgpack.packb(["f8", ["4"]]) + bytes(32), msgpack.packb({"f8": 1}),
 ], ids=range(9))
 def test_array_headers_are_checked(data):
-    payload = wire(sample(messages.Action), translation_m=msgpack.ExtType(ARRAY_EXTENSION, data))
+    payload = wire(sample(Action), translation_m=msgpack.ExtType(ARRAY_EXTENSION, data))
     with pytest.raises(MessageError):
-        decode(messages.Action, payload)
+        decode(Action, payload)
     with pytest.raises(MessageError):
-        decode(messages.Action, wire(sample(messages.Action), translation_m=msgpack.ExtType(2, bytes(24))))
+        decode(Action, wire(sample(Action), translation_m=msgpack.ExtType(2, bytes(24))))
 
 
 @pytest.mark.parametrize("topic", TOPICS.values(), ids=lambda t: t.name)

@@ -10,8 +10,9 @@ from services.planner.oracle import Oracle
 from services.simulator.objects import YCB_NAMES, load_mesh, ycb_folder
 from services.simulator.scenes import PAPER_SCENES, generate_split, load_scenes
 from shared.geometry import look_at, rotation_angle, rotation_xyz
-from shared.messages import Truth, encode
+from shared.messages import Truth
 from shared.task import LOWER_M, UPPER_M, Episode, Spheres, apply_action, clip, spheres_around, start_pose
+from shared.wire import encode
 
 SIZES = {"can": (0.10, 0.10, 0.14), "box": (0.07, 0.16, 0.21), "carton": (0.05, 0.09, 0.18), "tin": (0.07, 0.07, 0.10),
          "bottle": (0.10, 0.07, 0.19)}

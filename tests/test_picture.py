@@ -11,9 +11,10 @@ from PIL import Image
 
 from deploy.picture import COLOURS, draw, read_story
 from shared.errors import SaccadeError
-from shared.messages import Belief, Frame, Goal, Truth, encode
+from shared.messages import Belief, Frame, Goal, Truth
 from shared.recording import RunLog
 from shared.topics import BELIEF, FRAME, GOAL, TRUTH
+from shared.wire import encode
 
 RNG = np.random.default_rng(0)
 

@@ -14,9 +14,9 @@ from pathlib import Path
 from deploy.logs.check import missing
 from shared.bus import ZenohBus, free_endpoint
 from shared.config import Config
-from shared.messages import encode
 from shared.reading import RunReader
 from shared.topics import ACTION, PERCEPT, STATUS
+from shared.wire import encode
 from tests.samples import sample
 
 WAIT_S = 60

@@ -13,11 +13,12 @@ from mcap.reader import make_reader
 
 from deploy.logs.check import missing
 from shared.errors import SaccadeError
-from shared.messages import encode, field_types
+from shared.messages import field_types
 from shared.migrations import FORMAT
 from shared.reading import RunReader
 from shared.recording import RecordingStopped, RunLog, json_schema
 from shared.topics import ACTION, BELIEF, FRAME, PERCEPT, STATUS, TOPICS, TRUTH
+from shared.wire import encode
 from tests.samples import sample
 
 
@@ -149,7 +150,7 @@ def test_a_full_disk_stops_the_recording_once_and_keeps_what_there_is(tmp_path):
 FILL = """
 import resource, sys, pathlib
 import numpy as np
-from shared.messages import encode
+from shared.wire import encode
 from shared.recording import RecordingStopped, RunLog
 from shared.topics import FRAME
 from tests.samples import sample

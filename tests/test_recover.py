@@ -16,10 +16,10 @@ from deploy.logs.check import missing
 from deploy.logs.recover import RECOVERED, recover
 from deploy.logs.salvage import Salvage
 from shared.errors import SaccadeError
-from shared.messages import encode
 from shared.reading import RunReader
 from shared.recording import RecordingStopped, RunLog
 from shared.topics import ACTION, PERCEPT
+from shared.wire import encode
 from tests.samples import sample
 
 CHUNKS, EACH = 5, 3

@@ -16,10 +16,11 @@ from deploy.comparison import Comparison, differences
 from deploy.logs.check import missing
 from deploy.replay import REPLAYABLE
 from deploy.tolerances import TOLERANCES, tolerance_of
-from shared.messages import encode, field_types
+from shared.messages import field_types
 from shared.reading import RunReader
 from shared.recording import RunLog
 from shared.topics import ACTION, BELIEF, FRAME, PERCEPT, STATUS, TOPICS
+from shared.wire import encode
 from tests.fixtures.make import GOLDEN, IN_WORDS, WORDS, changes, in_words
 from tests.samples import sample
 

@@ -17,8 +17,9 @@ from shared.config import Config
 from shared.errors import SaccadeError
 from shared.geometry import look_at
 from shared.images import read_goal_image
-from shared.messages import Action, decode, encode
+from shared.messages import Action
 from shared.task import start_pose
+from shared.wire import decode, encode
 
 NAMES = ("soup_can", "rice_box")
 

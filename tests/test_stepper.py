@@ -7,10 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from shared.messages import MessageError, encode
 from shared.service import Service
 from shared.stepper import Stepper, settle
 from shared.topics import ACTION, FRAME, GOAL, PERCEPT, PLAN, TRUTH
+from shared.wire import MessageError, encode
 from tests.fakes.services import SIMULATOR, FakeSimulator
 from tests.samples import sample
 

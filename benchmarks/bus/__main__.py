@@ -29,7 +29,7 @@ from benchmarks.bus.contenders import CONTENDERS, OURS
 from benchmarks.bus.measure import CODED, ENCODED, KINDS, Plan, frames, within_one_process
 from benchmarks.bus.peer import Contender, run_round
 from shared.errors import SaccadeError
-from shared.messages import encode
+from shared.wire import encode
 
 YARDSTICKS = {ENCODED: "memory copy", CODED: "no bus"}
 NOT_INSTALLED = "not installed: pip install saccade[bench]"

@@ -11,10 +11,11 @@ from rich.table import Table
 
 from deploy.logs.cut import Range, range_of
 from deploy.logs.recover import RECOVERED
-from shared.messages import MessageError, Result, decode
+from shared.messages import Result
 from shared.reading import RunReader
 from shared.sequences import Sequences
 from shared.topics import RESULT, TOPICS
+from shared.wire import MessageError, decode
 
 SHORT = 12  # digits of a hash
 

@@ -13,8 +13,9 @@ from rich.markup import escape
 
 from services.recorder.core import LOG_NAME
 from shared.errors import SaccadeError
-from shared.messages import Message, MessageError, decode
+from shared.messages import Message
 from shared.reading import Recorded, RunReader
+from shared.wire import MessageError, decode
 
 SAY_EVERY = 50  # messages
 

@@ -14,7 +14,6 @@ from pathlib import Path
 from shared.bus import Bus, ZenohBus
 from shared.config import Config
 from shared.errors import SaccadeError
-from shared.messages import MessageError, decode
 from shared.outbox import KEPT_BYTES
 from shared.process import Health, Heartbeat, Inbox, run_process
 from shared.provenance import commit
@@ -22,6 +21,7 @@ from shared.reading import RunReader
 from shared.recording import FLUSH_S, RecordingStopped, RunLog
 from shared.sequences import Sequences
 from shared.topics import TOPICS, Topic
+from shared.wire import MessageError, decode
 
 NAME = "recorder"
 LOG_NAME = "run.mcap"

@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Self
 
 from shared.errors import SaccadeError
-from shared.messages import MessageError, Stamp, stamp_of
 from shared.reading import Recorded, RunReader
 from shared.topics import Topic
+from shared.wire import MessageError, Stamp, stamp_of
 
 PAUSE, QUIT = " ", "q"
 POLL_S = 0.02

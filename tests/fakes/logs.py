@@ -7,9 +7,9 @@ import math
 import numpy as np
 
 from shared.geometry import look_at
-from shared.messages import encode
 from shared.recording import RunLog
 from shared.topics import BELIEF, FRAME, GOAL, PERCEPT, PLAN, RESULT, STATUS, TRUTH
+from shared.wire import encode
 from tests.samples import sample
 
 INTRINSICS = np.array([40.0, 41.0, 15.0, 11.0])
