@@ -40,7 +40,8 @@ OnMoved = Callable[[Topic, str | None, Message, Message], None]
 
 @dataclass(frozen=True)
 class Replay:
-    """What is to be played into what. `config` is the recorded one, with what was changed by the user."""
+    """What is to be played into what. `config` is the recorded one, with what was changed by the user. `live`: it was
+    recorded live, so that not every step was taken by all."""
 
     log: Path
     into: tuple[str, ...]
@@ -49,6 +50,7 @@ class Replay:
     selection: Selection
     outputs: Selection
     one_by_one: bool = False
+    live: bool = False
 
     @property
     def services(self) -> list[Service]:
@@ -77,6 +79,7 @@ def prepare(log: Path, into: Sequence[str], values: dict, *, pace: Pace, topics:
         raise SaccadeError(f"--into {strange[0]}: choose from {', '.join(REPLAYABLE)}; the log stands for the rest")
     ordered = tuple(name for name in REPLAYABLE if name in into)
     config, run, cut = recorded_config(log)
+    live = config.bus.live
     config = config.with_values({"run": run, "bus.wait_for": [], "bus.live": False, "bus.endpoint": "tcp/127.0.0.1:0",
                                  "bus.first_step": max(start_step, cut)} | values)
     services = [service_of(name) for name in ordered]
@@ -88,7 +91,7 @@ def prepare(log: Path, into: Sequence[str], values: dict, *, pace: Pace, topics:
         return Selection(names, episode=episode, start_step=start_step, end_step=end_step)
 
     return Replay(log, ordered, config, pace, chosen(inputs), chosen(tuple(TOPICS[name] for name in sorted(made))),
-                  one_by_one)
+                  one_by_one, live)
 
 
 def recorded_config(log: Path) -> tuple[Config, str, int]:
@@ -103,10 +106,12 @@ def recorded_config(log: Path) -> tuple[Config, str, int]:
 
 def replay_here(replay: Replay, out: Path, keys: Keys, say: Callable[[str], None],
                 on_moved: OnMoved | None = None) -> Outcome:
-    """Within this process: the services' cores, step by step, as on the bus to the byte."""
+    """Within this process: the services' cores, step by step, as on the bus to the byte. Of a log that was recorded
+    live each service takes the steps that it took then."""
     config, outcome = replay.config, Outcome(out / LOG_NAME)
-    steppers = [Stepper(service, core, config.names, first_step=config.bus.first_step)
+    steppers = [Stepper(service, core, config.names, live=replay.live, first_step=config.bus.first_step)
                 for service, core in pairs_of(replay.into, config)]
+    taken = steps_taken(replay) if replay.live else None
     log = new_log(out, config)
     twins = Twins(outcome.comparison, on_moved)
 
@@ -121,10 +126,9 @@ def replay_here(replay: Replay, out: Path, keys: Keys, say: Callable[[str], None
             waiting = deque([Output(entry.topic, decode(entry.topic.type, entry.payload), entry.part)])
             while waiting:
                 output = waiting.popleft()
-                for stepper in steppers:
-                    if output.topic not in stepper.service.inputs:
-                        continue
-                    stepper.offer(output.topic, output.part, settle(output.message))
+                for stepper in (s for s in steppers if _is_input(output, s.service, taken)):
+                    with suppress(MessageError):  # counted where it is recorded: a stranger's
+                        stepper.offer(output.topic, output.part, settle(output.message))
                     while (made := stepper.advance()) is not None:
                         for each in made:
                             publish(each)
@@ -133,6 +137,25 @@ def replay_here(replay: Replay, out: Path, keys: Keys, say: Callable[[str], None
         log.close()
     outcome.late_s = replay.pace.late_s
     return outcome
+
+
+def steps_taken(replay: Replay) -> dict[str, set[tuple[int, int]]]:
+    """Of each service the (episode, step) pairs that it answered in the recording."""
+    taken: dict[str, set[tuple[int, int]]] = {name: set() for name in replay.into}
+    makers = {topic.name: service.name for service in replay.services for topic in service.outputs}
+    for entry in RunReader(replay.log).entries():
+        if entry.topic.name in makers:
+            with suppress(MessageError):
+                stamp = stamp_of(entry.payload)
+                taken[makers[entry.topic.name]].add((stamp.episode, stamp.step))
+    return taken
+
+
+def _is_input(output: Output, service: Service, taken: dict[str, set[tuple[int, int]]] | None) -> bool:
+    if output.topic not in service.inputs:
+        return False
+    at = (output.message.episode, output.message.step)
+    return output.topic.latched or taken is None or at in taken[service.name]
 
 
 def new_log(out: Path, config: Config) -> RunLog:
@@ -182,7 +205,10 @@ class Twins:
 
 def replay_on_bus(replay: Replay, out: Path, keys: Keys, say: Callable[[str], None],
                   on_moved: OnMoved | None = None) -> Outcome:
-    """On a bus of its own, one process per service, recorded by the recorder."""
+    """On a bus of its own, one process per service, recorded by the recorder. Raises SaccadeError for a log that was
+    recorded live: which steps a process takes then is a matter of time."""
+    if replay.live:
+        raise SaccadeError(f"log {replay.log} was recorded live: add --bus local, which takes the same steps")
     config = replay.config.with_values({"bus.endpoint": free_endpoint(replay.config.bus.endpoint)})
     names = ("router", *replay.into, "recorder")
     processes = [process for process in PROCESSES if process.name in names]

@@ -20,7 +20,9 @@ import deploy.cli as cli
 from deploy.display import Display, line, panel
 from deploy.logs.check import missing
 from deploy.picture import read_story
+from deploy.replay import prepare, replay_here, replay_on_bus
 from deploy.run import in_world, run
+from services.replayer.core import Keys, Pace
 from shared.config import REPOSITORY, Config, load
 from shared.errors import SaccadeError
 from shared.messages import Belief, Frame, Plan, Status
@@ -107,6 +109,12 @@ def test_live_processes_find_the_same_whatever_they_skip(filmed, tmp_path):
     assert load(tmp_path / "r" / "config.json").bus.live
     assert text.count("found ") == len(filmed[2])
     assert (tmp_path / "r" / "picture.png").is_file()
+    replay = prepare(tmp_path / "r" / "run.mcap", ("perception", "belief", "planner"), {}, pace=Pace())
+    comparison = replay_here(replay, tmp_path / "again", Keys(enabled=False), print).comparison
+    assert comparison.compared > 3 * seen
+    assert (comparison.unequal, comparison.equal) == (0, True)
+    with pytest.raises(SaccadeError, match="was recorded live: add --bus local"):
+        replay_on_bus(replay, tmp_path / "bus", Keys(enabled=False), print)
 
 
 def test_ctrl_c_ends_a_run_with_its_log_and_its_picture(filmed, tmp_path):
