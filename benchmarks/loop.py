@@ -19,7 +19,7 @@ from shared.config import Config
 from shared.loop import run_local
 from shared.topics import FRAME, TRUTH
 
-ROUNDS = 5
+ROUNDS = 4
 CONFIG = Config().with_values({"seed": 3, "scene.names": ["coffee_can", "cereal_box", "rice_box", "soup_can",
                                                           "squeeze_bottle"], "scene.count": 4})
 

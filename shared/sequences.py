@@ -7,6 +7,7 @@ import dataclasses
 from shared.messages import Message
 from shared.service import Output
 from shared.topics import Topic
+from shared.wire import Stamp
 
 Key = tuple[str, str | None]  # topic and part
 Episode = tuple[str, int]  # run and number
@@ -41,7 +42,7 @@ class Sequences:
         self._last_step: dict[tuple[Key, Episode], int] = {}
         self._missing: dict[Key, set[tuple[str, int, int]]] = {}
 
-    def take(self, topic: Topic, part: str | None, message: Message) -> int | None:
+    def take(self, topic: Topic, part: str | None, message: Message | Stamp) -> int | None:
         """How many messages of this key are missing just before this one; None for one that was there already."""
         key, episode, seq = (topic.name, part), (message.run, message.episode), message.seq
         if not topic.in_step:
@@ -76,7 +77,7 @@ class Sequences:
         """The first episode of which something has not come; 0 where all has."""
         return min((episode for lost in self._missing.values() for _, episode, _ in lost), default=0)
 
-    def begins(self, topic: Topic, part: str | None, message: Message) -> bool:
+    def begins(self, topic: Topic, part: str | None, message: Message | Stamp) -> bool:
         """Whether this is the first message of its key in a later episode than those before it."""
         known = self._next.get((topic.name, part), {})
         return topic.in_step and bool(known) and (message.run, message.episode) not in known

@@ -21,7 +21,7 @@ from shared.reading import RunReader
 from shared.recording import FLUSH_S, RecordingStopped, RunLog
 from shared.sequences import Sequences
 from shared.topics import TOPICS, Topic
-from shared.wire import MessageError, decode
+from shared.wire import MessageError, stamp_of
 
 NAME = "recorder"
 LOG_NAME = "run.mcap"
@@ -111,8 +111,8 @@ class Recorder:
     def _take(self, topic: Topic, part: str | None, payload: bytes) -> None:
         self.health.received += 1
         try:
-            message = decode(topic.type, payload)
-            if message.run == self._run and self._sequences.begins(topic, part, message):
+            stamp = stamp_of(payload)
+            if stamp.run == self._run and self._sequences.begins(topic, part, stamp):
                 self._write_kept([topic], self._last[topic.name, part])  # how the last episode ended may be lost
         except MessageError as error:  # recorded all the same: the log is what was on the wire
             self.health.refuse(topic, part, error)
@@ -146,12 +146,12 @@ class Recorder:
     def _write(self, log: RunLog, topic: Topic, part: str | None, payload: bytes, time_ns: int | None = None) -> None:
         sequence = 0
         with contextlib.suppress(MessageError):
-            message = decode(topic.type, payload)
-            if self._sequences.take(topic, part, message) is None:
+            stamp = stamp_of(payload)
+            if self._sequences.take(topic, part, stamp) is None:
                 return
-            sequence, key = message.seq, (topic.name, part)
-            if topic.in_step and message.run == self._run:
-                self._last[key] = max(self._last.get(key, (0, 0)), (message.episode, message.step))
+            sequence, key = stamp.seq, (topic.name, part)
+            if topic.in_step and stamp.run == self._run:
+                self._last[key] = max(self._last.get(key, (0, 0)), (stamp.episode, stamp.step))
         log.write(topic, part, payload, sequence=sequence, log_time_ns=time_ns)
 
 
