@@ -11,10 +11,13 @@ import time
 from contextlib import closing
 from pathlib import Path
 
+import pytest
+
 from deploy.logs.check import missing
 from shared.bus import ZenohBus, free_endpoint
 from shared.config import Config
 from shared.reading import RunReader
+from shared.recording import RunLog
 from shared.topics import ACTION, PERCEPT, STATUS
 from shared.wire import encode
 from tests.samples import sample
@@ -29,7 +32,7 @@ class RecorderProcess:
     def __init__(self, folder: Path, limit_bytes: int | None = None) -> None:
         endpoint = free_endpoint("tcp/127.0.0.1:0")
         self.bus = ZenohBus(endpoint, world="test", listen=True)
-        self.said: list = []
+        self.said, self.folder = [], folder
         self.bus.subscribe([STATUS], lambda _topic, _part, payload: self.said.append(payload))
         folder.mkdir(exist_ok=True)
         Config().with_values({"bus.endpoint": endpoint, "bus.world": "test"}).save(folder / "config.json")
@@ -42,6 +45,10 @@ class RecorderProcess:
         end = time.monotonic() + WAIT_S
         while not condition():
             assert time.monotonic() < end, "it did not come"
+            if self.process.poll() is not None:
+                (self.folder / "said").write_text(self.process.stderr.read())
+                self.close()
+                raise AssertionError("it has ended")
             time.sleep(0.01)
 
     def close(self) -> None:
@@ -85,6 +92,35 @@ def test_the_recorder_finishes_its_file_and_tells_gaps(tmp_path):
     report = missing(tmp_path / "run" / "run.mcap")
     assert report.cut is None
     assert report.lost == {"saccade/test/action": 2}
+
+
+def test_a_recorder_that_is_started_again_goes_on_with_its_log(tmp_path):
+    """What was sent while it was away nobody keeps here; what it had written is all there, once."""
+    folder = tmp_path / "run"
+    for first in (0, 10):
+        with closing(RecorderProcess(folder)) as recorder:
+            for seq in range(first, first + 5):
+                recorder.bus.publish(ACTION, None, encode(sample(ACTION.type, run="run", step=seq, seq=seq)))
+            time.sleep(1.0)  # longer than it takes to reach the disk
+    steps = [m.step for t, _, m in RunReader(folder / "run.mcap") if t == ACTION]
+    assert steps == [*range(5), *range(10, 15)]
+    assert [path.name for path in folder.glob("*.mcap")] == ["run.mcap"]
+
+
+@pytest.mark.parametrize(("run", "limit_bytes", "reason"), [
+    ("other", None, "of the run other: move it away"), ("run", 20_000, "recording stopped")])
+def test_a_log_that_cannot_be_gone_on_with_is_left_as_it_is(tmp_path, run, limit_bytes, reason):
+    folder = tmp_path / "run"
+    folder.mkdir()
+    log = RunLog(folder / "run.mcap", world="test", metadata={"run": {"run": run}})
+    for seq in range(200):
+        log.write(ACTION, None, encode(sample(ACTION.type, run=run, step=seq, seq=seq)) + os.urandom(500))
+    log.close()
+    before = (folder / "run.mcap").read_bytes()
+    with pytest.raises(AssertionError, match="ended"), closing(RecorderProcess(folder, limit_bytes=limit_bytes)):
+        pass
+    assert (folder / "run.mcap").read_bytes() == before
+    assert reason in (folder / "said").read_text()
 
 
 def test_a_recorder_without_room_says_so_and_the_bus_goes_on(tmp_path):

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import itertools
 import platform
 import sys
 import time
 from collections.abc import Sequence
+from functools import partial
 from importlib import metadata
 from pathlib import Path
 
@@ -15,7 +17,7 @@ from shared.bus import Bus, ZenohBus
 from shared.config import Config
 from shared.errors import SaccadeError
 from shared.outbox import KEPT_BYTES
-from shared.process import Health, Heartbeat, Inbox, run_process
+from shared.process import Health, Heartbeat, Inbox, Item, run_process
 from shared.provenance import commit
 from shared.reading import RunReader
 from shared.recording import FLUSH_S, RecordingStopped, RunLog
@@ -59,54 +61,68 @@ class Recorder:
         self.health, self._bus, self._run = Health(NAME), bus, config.run or folder.name
         self._sequences = Sequences(from_start=True, cut=config.bus.first_step > 0)
         self._last: dict[tuple[str, str | None], tuple[int, int]] = {}  # of each key: episode and step
-        self._asked_s, self._ask_again_s = 0.0, ASKED_AGAIN_S
+        self._asked_s, self._ask_again_s, self._news_s = 0.0, ASKED_AGAIN_S, time.monotonic()
         self.log = self._open(folder / LOG_NAME, config)
 
     def record(self, inbox: Inbox) -> Health:
         """Until the inbox is stopped. A log that can take no more does not stop the agent: it is said on the bus at
         once, and raised as RecordingStopped at the end."""
-        health, stopped, news_s = self.health, None, time.monotonic()
+        health, stopped = self.health, None
+        works = itertools.chain([self._ask_for_news, lambda: health.say("ready")],
+                                (partial(self._work_off, item) for item in inbox.items(tick_s=FLUSH_S)),
+                                [self.log.close])
         with Heartbeat(self._bus, health, inbox.stop):
-            self._ask_for_news()
-            health.say("ready")
-            for item in inbox.items(tick_s=FLUSH_S):
+            for work in works:
                 try:
-                    if item is not None:
-                        self._take(*item)
-                    else:
-                        self.log.flush_if_due()
-                    if item is not None and item[0].in_step:
-                        news_s = time.monotonic()
-                    elif time.monotonic() - news_s >= QUIET_S:
-                        news_s = time.monotonic()
-                        self._ask_for_news()
-                        self._ask_for_missing()
+                    work()
                 except RecordingStopped as error:
                     stopped = error
                     health.say("not recording", str(error))
-            try:
-                self.log.close()
-            except RecordingStopped as error:
-                stopped = error
-                health.say("not recording", str(error))
         if stopped is not None:
             raise stopped
         return health
+
+    def _work_off(self, item: Item | None) -> None:
+        """A message, or that none has come for a while."""
+        if item is not None:
+            self._take(*item)
+        else:
+            self.log.flush_if_due()
+        if item is not None and item[0].in_step:
+            self._news_s = time.monotonic()
+        elif time.monotonic() - self._news_s >= QUIET_S:
+            self._news_s = time.monotonic()
+            self._ask_for_news()
+            self._ask_for_missing()
 
     def _open(self, path: Path, config: Config) -> RunLog:
         before = path.with_suffix(".before.mcap")  # is there while a log is copied that a killed recorder left
         if path.exists() and not before.exists():
             path.rename(before)
         path.unlink(missing_ok=True)
-        log = RunLog(path, world=config.bus.world, configuration=config.model_dump_json(indent=2),
-                     metadata=describe(config, self._run))
-        if before.exists():
-            with contextlib.suppress(SaccadeError):  # killed before it wrote anything
-                for topic, part, payload, time_ns in RunReader(before).entries():
-                    self._write(log, topic, part, payload, time_ns)
-            log.flush()
-            before.unlink()
-        return log
+        try:
+            log = RunLog(path, world=config.bus.world, configuration=config.model_dump_json(indent=2),
+                         metadata=describe(config, self._run))
+            if before.exists():
+                self._copy(before, log)
+                before.unlink()
+            return log
+        except SaccadeError:
+            if before.exists():  # nothing that was recorded is lost
+                before.replace(path)
+            raise
+
+    def _copy(self, before: Path, log: RunLog) -> None:
+        """What the recorder had written before it was killed. Raises SaccadeError if that is another run's."""
+        reader = None
+        with contextlib.suppress(SaccadeError):  # killed before it wrote anything
+            reader = RunReader(before)
+        for topic, part, payload, time_ns in reader.entries() if reader else ():
+            run = reader.metadata.get("run", {}).get("run")
+            if run != self._run:
+                raise SaccadeError(f"log {log.path} is there already, of the run {run}: move it away")
+            self._write(log, topic, part, payload, time_ns)
+        log.flush()
 
     def _take(self, topic: Topic, part: str | None, payload: bytes) -> None:
         self.health.received += 1
