@@ -158,16 +158,25 @@ class Display:
         if not self.plain:
             self._live.stop()
 
+    @property
+    def topics(self) -> tuple[Topic, ...]:
+        """What is shown: all but images and percepts."""
+        return (self._view, PLAN, BELIEF, STATUS, RESULT)
+
+    @property
+    def _view(self) -> Topic:
+        return FRAME if self._camera else TRUTH
+
     def say(self, text: str) -> None:
         """A line that stays: what befell a service, what a camera assumes."""
         self.console.print(text, markup=False, highlight=False, soft_wrap=True)
 
     def take(self, topic: Topic, part: str | None, message: Message) -> None:
-        """To be called with every message of the run."""
+        """To be called with every message of these topics."""
         self.progress.take(topic, part, message)
         if topic == STATUS and part == self._camera:
             self.note(message.note)
-        if self.plain and topic == (FRAME if self._camera else TRUTH) and message.step % LINE_EVERY == 0:
+        if self.plain and topic == self._view and message.step % LINE_EVERY == 0:
             self.console.print(line(self.progress), markup=False, highlight=False, soft_wrap=True)
 
     def note(self, text: str) -> None:

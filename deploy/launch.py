@@ -7,7 +7,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +25,7 @@ from shared.wire import MessageError, decode
 
 OnMessage = Callable[[Topic, str | None, Message], None]
 LOG_NAME = "run.mcap"
+FOLLOWED = (STATUS, PLAN, RESULT)  # by which the launcher knows how far a run is
 READY_S = 120.0  # loading weights on a busy machine takes its time
 POLL_S = 0.2
 QUIET_S = 2.0  # without news a result is asked for: it may have been published while the router was away
@@ -37,17 +38,19 @@ ROUTER, *SERVICES = PROCESSES = tuple(Process(name, f"services.{name}") for name
 
 
 def launch(config: Config, run_dir: Path, on_message: OnMessage | None = None,
-           processes: Sequence[Process] = PROCESSES, say: Callable[[str], None] | None = None) -> list[Result]:
+           processes: Sequence[Process] = PROCESSES, say: Callable[[str], None] | None = None,
+           topics: Sequence[Topic] | None = None) -> list[Result]:
     """Runs all episodes, one process per service, and returns their results in order, none where nobody judges; the log
     is `run_dir`/run.mcap. A run ends when its source has finished and what it sent has been worked off.
 
-    `on_message(topic, part, message)` sees every valid message once, on the caller's thread; `say(text)` is told of
-    services that died and were started again, and of those that hang. The first process is the router, the second the
-    source. Raises SaccadeError, naming the service, if one says why it cannot run, dies too often or is not ready
-    within READY_S.
+    `on_message(topic, part, message)` sees every valid message once, on the caller's thread, of these topics or of all:
+    what nobody looks at costs nothing. `say(text)` is told of services that died and were started again, and of
+    those that hang. The first process is the router, the second the source. Raises SaccadeError, naming the service, if
+    one says why it cannot run, dies too often or is not ready within READY_S.
     """
     config = resolve(config, processes)
-    with running(config, run_dir, processes, None if on_message else (STATUS, PLAN, RESULT), say) as graph:
+    wanted = topics if on_message else ()
+    with running(config, run_dir, processes, wanted if wanted is None else {*wanted, *FOLLOWED}, say) as graph:
         results = _follow(graph, processes, on_message)
         graph.supervisor.stop()
         _drain(graph.messages, on_message)
@@ -67,7 +70,7 @@ class Graph:
 
 
 @contextmanager
-def running(config: Config, run_dir: Path, processes: Sequence[Process], topics: Sequence[Topic] | None,
+def running(config: Config, run_dir: Path, processes: Sequence[Process], topics: Iterable[Topic] | None,
             say: Callable[[str], None] | None = None) -> Iterator[Graph]:
     """The processes of a resolved configuration in a new run folder, ended when the context is left. The first is the
     router, and is there before the others. `topics`: which messages are wanted, None for all."""

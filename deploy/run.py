@@ -45,7 +45,7 @@ def run(config: Config, *, agent: str, out: Path | None, plain: bool, console: C
     with Display(console, plain=plain, judged=judged, camera=place.source if place.live else None) as display:
         try:
             if processes:
-                results = launch(config, folder, display.take, processes, display.say)
+                results = launch(config, folder, display.take, processes, display.say, display.topics)
             else:
                 results = run_here(config, agent, folder, display, world)
         except KeyboardInterrupt:
