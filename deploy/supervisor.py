@@ -47,7 +47,7 @@ class Supervisor:
         self._heard_s: dict[str, float] = {}  # since a service was (re)started: when it was last heard of
         self._up: set[str] = set()  # those that have started, and not ended since
         self._silent: set[str] = set()
-        self._stopped = False
+        self._stopped, self._checked_s = False, time.monotonic()
         self._restarts: dict[str, deque[float]] = defaultdict(deque)
 
     def start(self, process: Process) -> None:
@@ -93,6 +93,9 @@ class Supervisor:
             if child.poll() is not None:
                 self._start_again(name, child.returncode)
         now_s = time.monotonic()
+        if now_s - self._checked_s > HUNG_S:  # this process was suspended: it has heard nobody
+            self._heard_s = dict.fromkeys(self._heard_s, now_s)
+        self._checked_s = now_s
         silent = {name: now_s - at_s for name, at_s in self._heard_s.items() if now_s - at_s > HUNG_S}
         router = next(iter(self._processes), None)  # while it is silent, nobody else can be heard
         for name in [router] if router in silent else silent:

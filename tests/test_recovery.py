@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import random
 import signal
+import subprocess
+import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable
@@ -115,6 +117,23 @@ def test_a_service_that_hangs_for_long_is_ended_and_started_again(tmp_path, monk
     assert_as_if_nothing_had_happened(run_dir, results)
     assert [text.split(":")[0] for text in said][:3] == [
         "perception hangs", "perception is ended", "perception is started again"]
+
+
+def test_a_launcher_that_was_suspended_blames_nobody(tmp_path):
+    run_dir = tmp_path / "run"
+    launcher = subprocess.Popen([sys.executable, "-m", "tests.fakes.launch", str(run_dir), "1", "3000"],
+                                stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    try:
+        while process_of(run_dir, "recorder") is None:
+            time.sleep(0.05)
+        time.sleep(1.5)
+        os.kill(launcher.pid, signal.SIGSTOP)
+        time.sleep(4.0)  # twice what makes a silent service a hung one
+        os.kill(launcher.pid, signal.SIGCONT)
+        told, _ = launcher.communicate(timeout=300)
+    finally:
+        launcher.kill()
+    assert told == "1\n"
 
 
 def test_the_shipped_agent_ends_where_it_would_have_ended(tmp_path):
