@@ -116,7 +116,7 @@ def _messages(arrived: queue.SimpleQueue, bus: Bus, supervisor: Supervisor, run:
         if now_s - looked_s >= POLL_S:
             looked_s = now_s
             supervisor.check()
-        if now_s - news_s >= QUIET_S:
+        if now_s - news_s >= QUIET_S and not supervisor.stopped:
             news_s = now_s
             for topic, part, payload, *_ in bus.recall((RESULT,), (run, 0, 0)):
                 arrived.put((topic, part, payload))

@@ -47,7 +47,7 @@ class Supervisor:
         self._heard_s: dict[str, float] = {}  # since a service was (re)started: when it was last heard of
         self._up: set[str] = set()  # those that have started, and not ended since
         self._silent: set[str] = set()
-        self._stopped, self._checked_s = False, time.monotonic()
+        self.stopped, self._checked_s = False, time.monotonic()
         self._restarts: dict[str, deque[float]] = defaultdict(deque)
 
     def start(self, process: Process) -> None:
@@ -87,7 +87,7 @@ class Supervisor:
 
         Raises SaccadeError for a service that says why it cannot run, or has died too often.
         """
-        if self._stopped:
+        if self.stopped:
             return
         for name, child in list(self._children.items()):
             if child.poll() is not None:
@@ -110,7 +110,7 @@ class Supervisor:
     def stop(self) -> None:
         """Ends the services in the order of the data, so that each works off what the one before it has sent; the
         router, which came first, last."""
-        self._stopped = True
+        self.stopped = True
         router, others = [*self._children.values()][:1], [*self._children.values()][1:]
         for child in others + router:
             try:
