@@ -17,7 +17,7 @@ from typing import Protocol
 from shared.errors import SaccadeError
 from shared.outbox import PAGE_BYTES, Kept, Since
 from shared.topics import ROOT, Topic, parse_key
-from shared.wire import MAX_BYTES, MessageError, decode
+from shared.wire import MAX_BYTES, MessageError, stamp_of
 
 Deliver = Callable[[Topic, str | None, bytes], None]  # runs on the bus's thread: must only put its arguments somewhere
 Answer = Callable[[Iterable[Topic], Since | None, int], list[Kept]]
@@ -152,7 +152,7 @@ class ZenohBus:
             del asked, query  # a query ends when it is forgotten
 
     def recall(self, topics: Iterable[Topic], since: Since | None = None, limit_bytes: int = PAGE_BYTES) -> list[Kept]:
-        """Asks one topic after the other; what is no valid message is left out."""
+        """Asks one topic after the other; what does not begin like a message is left out."""
         question = json.dumps({"since": since, "limit": limit_bytes})
         return [kept for topic in topics for kept in self._recall(topic, question)]
 
@@ -166,9 +166,7 @@ class ZenohBus:
                     if sample is not None and sample.attachment is not None:
                         _, _, part = parse_key(str(sample.key_expr))
                         payload = sample.payload.to_bytes()
-                        message = decode(topic.type, payload)
-                        yield Kept(topic, part, payload, (message.run, message.episode, message.step),
-                                   int(sample.attachment.to_bytes()))
+                        yield Kept(topic, part, payload, stamp_of(payload)[:3], int(sample.attachment.to_bytes()))
         except self._zenoh.ZError:
             return  # no router at present
 

@@ -11,6 +11,7 @@ import time
 from contextlib import closing
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from deploy.logs.check import missing
@@ -121,6 +122,21 @@ def test_a_log_that_cannot_be_gone_on_with_is_left_as_it_is(tmp_path, run, limit
         pass
     assert (folder / "run.mcap").read_bytes() == before
     assert reason in (folder / "said").read_text()
+
+
+def test_what_is_no_message_does_not_take_the_number_of_one(tmp_path):
+    """Someone's broken message comes first, with a good beginning: both are in the log, and one was refused."""
+    good = encode(sample(ACTION.type, run="run", step=0, seq=0))
+    value = sample(ACTION.type).translation_m
+    broken = good.replace(value.tobytes(), np.full_like(value, np.nan).tobytes(), 1)
+    with closing(RecorderProcess(tmp_path / "run")) as recorder:
+        recorder.bus.publish(ACTION, None, broken)
+        recorder.bus.publish(ACTION, None, good)
+        recorder.until(lambda: b"refused: action: translation_m: not finite" in b"".join(recorder.said))
+        recorder.process.terminate()
+        recorder.process.wait(WAIT_S)
+    entries = RunReader(tmp_path / "run" / "run.mcap").entries()
+    assert [e.payload for e in entries if e.topic == ACTION] == [broken, good]
 
 
 def test_a_recorder_without_room_says_so_and_the_bus_goes_on(tmp_path):

@@ -23,7 +23,7 @@ from shared.reading import RunReader
 from shared.recording import FLUSH_S, RecordingStopped, RunLog
 from shared.sequences import Sequences
 from shared.topics import TOPICS, Topic
-from shared.wire import MessageError, stamp_of
+from shared.wire import MessageError, decode, stamp_of
 
 NAME = "recorder"
 LOG_NAME = "run.mcap"
@@ -126,12 +126,10 @@ class Recorder:
 
     def _take(self, topic: Topic, part: str | None, payload: bytes) -> None:
         self.health.received += 1
-        try:
+        with contextlib.suppress(MessageError):
             stamp = stamp_of(payload)
             if stamp.run == self._run and self._sequences.begins(topic, part, stamp):
                 self._write_kept([topic], self._last[topic.name, part])  # how the last episode ended may be lost
-        except MessageError as error:  # recorded all the same: the log is what was on the wire
-            self.health.refuse(topic, part, error)
         self._write(self.log, topic, part, payload)
         self.health.published = self.log.messages
         self._ask_for_missing()
@@ -161,13 +159,15 @@ class Recorder:
 
     def _write(self, log: RunLog, topic: Topic, part: str | None, payload: bytes, time_ns: int | None = None) -> None:
         sequence = 0
-        with contextlib.suppress(MessageError):
-            stamp = stamp_of(payload)
-            if self._sequences.take(topic, part, stamp) is None:
+        try:
+            message = decode(topic.type, payload)  # whole: what is no message must not take the number of one
+            if self._sequences.take(topic, part, message) is None:
                 return
-            sequence, key = stamp.seq, (topic.name, part)
-            if topic.in_step and stamp.run == self._run:
-                self._last[key] = max(self._last.get(key, (0, 0)), (stamp.episode, stamp.step))
+            sequence, key = message.seq, (topic.name, part)
+            if topic.in_step and message.run == self._run:
+                self._last[key] = max(self._last.get(key, (0, 0)), (message.episode, message.step))
+        except MessageError as error:  # recorded all the same: the log is what was on the wire
+            self.health.refuse(topic, part, error)
         log.write(topic, part, payload, sequence=sequence, log_time_ns=time_ns)
 
 
