@@ -17,6 +17,7 @@ import pytest
 from deploy.logs.check import missing
 from shared.bus import ZenohBus, free_endpoint
 from shared.config import Config
+from shared.outbox import Outbox
 from shared.reading import RunReader
 from shared.recording import RunLog
 from shared.topics import ACTION, PERCEPT, STATUS
@@ -137,6 +138,19 @@ def test_what_is_no_message_does_not_take_the_number_of_one(tmp_path):
         recorder.process.wait(WAIT_S)
     entries = RunReader(tmp_path / "run" / "run.mcap").entries()
     assert [e.payload for e in entries if e.topic == ACTION] == [broken, good]
+
+
+def test_what_was_lost_stands_in_the_log_before_what_told_of_it(tmp_path):
+    outbox = Outbox()
+    with closing(RecorderProcess(tmp_path / "run")) as recorder:
+        recorder.bus.answer([ACTION], outbox.answer)
+        for seq in range(3):
+            message = sample(ACTION.type, run="run", step=seq, seq=seq)
+            outbox.keep(ACTION, None, message, encode(message))
+            if seq != 1:
+                recorder.bus.publish(ACTION, None, encode(message))
+        time.sleep(1.0)  # longer than it takes to reach the disk
+    assert [m.seq for t, _, m in RunReader(tmp_path / "run" / "run.mcap") if t == ACTION] == [0, 1, 2]
 
 
 def test_a_recorder_without_room_says_so_and_the_bus_goes_on(tmp_path):

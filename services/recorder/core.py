@@ -20,7 +20,7 @@ from shared.outbox import KEPT_BYTES
 from shared.process import Health, Heartbeat, Inbox, Item, run_process
 from shared.provenance import commit
 from shared.reading import RunReader
-from shared.recording import FLUSH_S, RecordingStopped, RunLog
+from shared.recording import CUT, FLUSH_S, RecordingStopped, RunLog
 from shared.sequences import Sequences
 from shared.topics import TOPICS, Topic
 from shared.wire import MessageError, decode, stamp_of
@@ -161,8 +161,10 @@ class Recorder:
         sequence = 0
         try:
             message = decode(topic.type, payload)  # whole: what is no message must not take the number of one
-            if self._sequences.take(topic, part, message) is None:
+            if (lost := self._sequences.take(topic, part, message)) is None:
                 return
+            if lost and time_ns is None:  # what came before it stands before it
+                self._ask_for_missing()
             sequence, key = message.seq, (topic.name, part)
             if topic.in_step and message.run == self._run:
                 self._last[key] = max(self._last.get(key, (0, 0)), (message.episode, message.step))
@@ -174,7 +176,7 @@ class Recorder:
 def describe(config: Config, run: str) -> dict[str, dict[str, str]]:
     """What the log says about its origin: configuration hash, seed, versions, weights' hashes."""
     text = config.model_dump_json()
-    cut = {"cut": {"start": str(config.bus.first_step)}} if config.bus.first_step else {}
+    cut = {CUT: {"start": str(config.bus.first_step)}} if config.bus.first_step else {}
     return {**cut, "run": {"run": run, "seed": str(config.seed), "commit": commit(),
                     "configuration_sha256": hashlib.sha256(text.encode()).hexdigest()},
             "versions": {"python": platform.python_version(), **{name: _version(name) for name in PACKAGES}},
