@@ -14,6 +14,7 @@ from pathlib import Path
 
 from deploy.comparison import Comparison
 from deploy.launch import PROCESSES, Graph, running
+from deploy.logs.cut import range_of
 from deploy.registry import pairs_of, service_of
 from deploy.supervisor import CONFIG_NAME
 from services.recorder.core import LOG_NAME, describe
@@ -100,8 +101,8 @@ def recorded_config(log: Path) -> tuple[Config, str, int]:
     first = next((told for told in reader if told[0].in_step), None)
     if first is None or reader.configuration is None:
         raise SaccadeError(f"log {log} holds no {'messages' if first is None else 'configuration'}: nothing to replay")
-    cut = int(reader.metadata.get("cut", {}).get("start") or 0)
-    return validate(json.loads(reader.configuration), f"the log {log}"), first[2].run, cut
+    kept = range_of(reader)
+    return validate(json.loads(reader.configuration), f"the log {log}"), first[2].run, kept.start if kept else 0
 
 
 def replay_here(replay: Replay, out: Path, keys: Keys, say: Callable[[str], None],

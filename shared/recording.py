@@ -25,6 +25,7 @@ FLUSH_S = 0.4  # a chunk is closed this often: what a killed recorder may lose
 CONFIGURATION = "config.json"
 ENDED_EARLY = "ended_early"
 LOG = "log"  # metadata about the log itself: its format
+CUT = "cut"  # metadata of a log that does not begin with step 0, or is a part of another: which steps it has
 
 
 class RecordingStopped(SaccadeError):

@@ -16,7 +16,6 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
-import deploy.cli as cli
 from deploy.display import Display, line, panel
 from deploy.logs.check import missing
 from deploy.picture import read_story
@@ -30,6 +29,7 @@ from shared.reading import RunReader
 from shared.topics import BELIEF, FRAME, GOAL, PERCEPT, PLAN, RESULT, STATUS, TRUTH
 from tests.fakes.camera import LENS_PX, film, folder_of, written
 from tests.fakes.camera import line as pose_line
+from tests.front_door import call
 from tests.samples import sample
 
 VIEWS = 32
@@ -157,14 +157,6 @@ def test_with_a_goal_image_the_agent_says_where_it_is(filmed, tmp_path):
     messages = messages_of(tmp_path / "r" / "run.mcap")
     assert messages[GOAL.name, None][0].rgb is not None
     assert messages[PLAN.name, None][-1].target in filmed[2]
-
-
-def call(monkeypatch, capsys, *arguments) -> tuple[int, str, str]:
-    monkeypatch.setattr(sys, "argv", ["saccade", *map(str, arguments)])
-    with pytest.raises(SystemExit) as end:
-        cli.main()
-    out, err = capsys.readouterr()
-    return end.value.code or 0, out, err
 
 
 @pytest.mark.parametrize(("arguments", "words"), [

@@ -28,18 +28,10 @@ from shared.messages import Belief, Plan, Status, Truth
 from shared.reading import RunReader
 from shared.topics import BELIEF, PLAN, STATUS, TOPICS, TRUTH
 from tests.fakes.weights import write_random_weights
+from tests.front_door import call
 from tests.samples import sample
 
 NAMES = ("coffee_can", "soup_can")
-
-
-def call(monkeypatch, capsys, *arguments) -> tuple[int, str, str]:
-    """Exit code, stdout and stderr of a command, run within this process."""
-    monkeypatch.setattr(sys, "argv", ["saccade", *map(str, arguments)])
-    with pytest.raises(SystemExit) as end:
-        cli.main()
-    out, err = capsys.readouterr()
-    return end.value.code or 0, out, err
 
 
 def started(*arguments, **more) -> subprocess.Popen:

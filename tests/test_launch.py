@@ -9,7 +9,6 @@ import subprocess
 import sys
 import time
 from collections import defaultdict
-from pathlib import Path
 
 import pytest
 
@@ -22,22 +21,10 @@ from shared.loop import run_local
 from shared.messages import Status
 from shared.reading import RunReader
 from shared.topics import FRAME, RESULT, STATUS
-from tests.fakes.launch import FAKES, PARTS, configuration
+from tests.fakes.launch import FAKES, PARTS, configuration, processes_of
 from tests.fakes.services import pairs
 
 WAIT_S = 60
-
-
-def of_run(run_dir: Path) -> list[int]:
-    """Process ids of services that run on this folder's configuration."""
-    found = []
-    for path in Path("/proc").glob("[0-9]*/cmdline"):
-        try:
-            if f"{run_dir}/config.json".encode() in path.read_bytes():
-                found.append(int(path.parent.name))
-        except OSError:
-            continue
-    return found
 
 
 def until(condition) -> bool:
@@ -88,7 +75,7 @@ def test_the_caller_sees_every_message(run):
     last = {p: m for t, p, m in seen if t == STATUS and isinstance(m, Status)}
     assert {name: s.state for name, s in last.items()} == {process.name: "stopped" for process in PROCESSES}
     assert all((s.refused, s.gaps, s.skipped) == (0, 0, 0) for s in last.values())
-    assert of_run(run_dir) == []
+    assert processes_of(run_dir) == {}
 
 
 @pytest.mark.parametrize(("wish", "message"), [
@@ -98,7 +85,7 @@ def test_the_caller_sees_every_message(run):
 def test_a_service_that_ends_is_named_with_its_reason(tmp_path, wish, message):
     with pytest.raises(SaccadeError, match=message):
         launch(configuration(3, 8, wish), tmp_path / "run", None, FAKES)
-    assert of_run(tmp_path / "run") == []
+    assert processes_of(tmp_path / "run") == {}
     assert not missing(tmp_path / "run" / "run.mcap").cut
 
 
@@ -110,7 +97,7 @@ def test_a_port_in_use_starts_no_service(tmp_path):
             launch(configuration(1, 1).with_values({"bus.endpoint": endpoint}), tmp_path, None, FAKES)
     finally:
         other.close()
-    assert of_run(tmp_path) == []
+    assert processes_of(tmp_path) == {}
 
 
 def test_a_log_is_never_written_over(tmp_path, run):
@@ -132,10 +119,10 @@ def test_an_interrupted_launcher_leaves_no_process_and_a_readable_log(tmp_path, 
     try:
         log = run_dir / "run.mcap"
         assert until(lambda: log.exists() and any(t == FRAME for t, _, _ in RunReader(log)))
-        assert len(of_run(run_dir)) == len(PROCESSES)
+        assert len(processes_of(run_dir)) == len(PROCESSES)
         os.kill(launcher.pid, number)
         launcher.wait(WAIT_S)
-        assert until(lambda: of_run(run_dir) == [])
+        assert until(lambda: processes_of(run_dir) == {})
         report = missing(log)
         assert report.cut is None
         assert report.lost == {}
@@ -143,5 +130,5 @@ def test_an_interrupted_launcher_leaves_no_process_and_a_readable_log(tmp_path, 
     finally:
         launcher.kill()
         launcher.stdout.close()
-        for left in of_run(run_dir):
+        for left in processes_of(run_dir).values():
             os.kill(left, signal.SIGKILL)

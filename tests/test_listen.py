@@ -6,7 +6,6 @@ import io
 import math
 import os
 import signal
-import sys
 import threading
 import time
 from contextlib import closing
@@ -15,7 +14,6 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-import deploy.cli as cli
 from deploy.echo import block, of_array, show
 from deploy.hz import Rates, follow
 from deploy.listen import Heard, Live, Logged, Wanted, live, newest
@@ -26,6 +24,7 @@ from shared.outbox import Outbox
 from shared.topics import ACTION, FRAME, GOAL, GOAL_PERCEPT, PERCEPT, TOPICS, TRUTH
 from shared.wire import encode
 from tests.fakes.logs import story, write
+from tests.front_door import call
 from tests.samples import sample
 
 WAIT_S = 30
@@ -73,15 +72,6 @@ def press_ctrl_c():
 
     threading.Thread(target=press, daemon=True).start()
     return before
-
-
-def call(monkeypatch, capsys, *arguments):
-    """Exit code, stdout and stderr."""
-    monkeypatch.setattr(sys, "argv", ["saccade", *map(str, arguments)])
-    with pytest.raises(SystemExit) as end:
-        cli.main()
-    out, err = capsys.readouterr()
-    return end.value.code or 0, out, err
 
 
 @pytest.mark.parametrize(("key", "meant"), [

@@ -26,11 +26,10 @@ from shared.stepper import Stepper
 from shared.ticker import Ticker
 from shared.topics import ACTION, FRAME, GOAL, PERCEPT, PLAN, STATUS
 from shared.wire import MessageError, decode, encode
-from tests.fakes.launch import PARTS, configuration
+from tests.fakes.launch import PARTS, configuration, processes_of
 from tests.fakes.services import BELIEVER, PERCEPTION, PLANNER, FakeBelief, FakePerception, FakePlanner
 from tests.fakes.timed import TIMED, FakeCamera
 from tests.samples import sample
-from tests.test_recovery import process_of
 
 WAIT_S = 30  # for what must come; nothing is asserted about how long it takes
 AGENTS = ("perception", "belief", "planner")
@@ -249,7 +248,7 @@ def test_killed_while_nobody_waits_a_service_goes_on_with_the_newest(tmp_path, n
     def on_message(topic, part, message):
         if topic == PLAN and message.step >= 10 and not killed:
             killed.append(message.step)
-            os.kill(process_of(tmp_path / "run", name), signal.SIGKILL)
+            os.kill(processes_of(tmp_path / "run")[name], signal.SIGKILL)
 
     config = configuration(1, frames).with_values({"bus.live": True})
     said = []

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import sys
-
 import pytest
 
-import deploy.cli as cli
 from deploy.logs.check import abbreviated, missing
 from deploy.logs.cut import CUT, Range, cut, range_of
 from shared.errors import SaccadeError
@@ -15,6 +12,7 @@ from shared.reading import RunReader
 from shared.recording import RunLog
 from shared.topics import ACTION, FRAME, GOAL, PERCEPT, RESULT, STATUS, TRUTH
 from shared.wire import encode
+from tests.front_door import call
 from tests.samples import sample
 
 STEPS = 6
@@ -55,15 +53,6 @@ def run(tmp_path):
     write(tmp_path / "run" / "run.mcap", story(), versions={"x": "1"}, weights_sha256={"w": "0123456789abcdef"},
           run={"run": "r7", "seed": "3", "commit": "abc"})
     return tmp_path / "run"
-
-
-def call(monkeypatch, capsys, *arguments):
-    """Exit code, stdout and stderr."""
-    monkeypatch.setattr(sys, "argv", ["saccade", *map(str, arguments)])
-    with pytest.raises(SystemExit) as end:
-        cli.main()
-    out, err = capsys.readouterr()
-    return end.value.code or 0, out, err
 
 
 def test_info_tells_origin_episodes_and_keys(monkeypatch, capsys, run):

@@ -21,23 +21,12 @@ from shared.config import Config
 from shared.loop import run_local
 from shared.reading import RunReader
 from shared.topics import FRAME, STATUS
-from tests.fakes.launch import FAKES, PARTS, configuration
+from shared.wire import stamp_of
+from tests.fakes.launch import FAKES, PARTS, configuration, processes_of
 from tests.fakes.services import pairs
 
 EPISODES, STEPS = 3, 12
 NAMES = [process.name for process in PROCESSES]
-
-
-def process_of(run_dir: Path, name: str) -> int | None:
-    """The process id of a run's service."""
-    for path in Path("/proc").glob("[0-9]*/cmdline"):
-        try:
-            words = path.read_bytes().split(b"\0")
-        except OSError:
-            continue
-        if str(run_dir / "config.json").encode() in words and any(w.endswith(f".{name}".encode()) for w in words):
-            return int(path.parent.name)
-    return None
 
 
 def disturbed(run_dir: Path, at: dict[tuple[int, int], Callable[[], None]]) -> tuple[list, list[str]]:
@@ -53,8 +42,9 @@ def disturbed(run_dir: Path, at: dict[tuple[int, int], Callable[[], None]]) -> t
 
 
 def logged(path: Path) -> dict:
+    """By number: what was lost stands in the file where its publisher was asked for it."""
     keys = defaultdict(list)
-    for topic, part, payload, _ in RunReader(path).entries():
+    for topic, part, payload, _ in sorted(RunReader(path).entries(), key=lambda entry: stamp_of(entry.payload)):
         if topic != STATUS:
             keys[topic.name, part].append(payload)
     return dict(keys)
@@ -82,7 +72,7 @@ def test_a_service_killed_at_any_moment_goes_on_where_it_was(tmp_path, name):
 
     def kill() -> None:
         time.sleep(rng.random() * 0.02)
-        if (process := process_of(run_dir, name)) is not None:
+        if (process := processes_of(run_dir).get(name)) is not None:
             os.kill(process, signal.SIGKILL)
 
     results, said = disturbed(run_dir, dict.fromkeys(moments, kill))
@@ -102,7 +92,7 @@ def test_a_service_that_hangs_is_named_and_goes_on_when_it_is_let(tmp_path, monk
 
     def stop(topic, part, message):
         if topic == FRAME and not stopped:
-            stopped.append(process_of(run_dir, "belief"))
+            stopped.append(processes_of(run_dir)["belief"])
             os.kill(stopped[0], signal.SIGSTOP)
 
     results = launch(configuration(EPISODES, STEPS), run_dir, stop, FAKES, say)
@@ -113,7 +103,8 @@ def test_a_service_that_hangs_is_named_and_goes_on_when_it_is_let(tmp_path, monk
 def test_a_service_that_hangs_for_long_is_ended_and_started_again(tmp_path, monkeypatch):
     monkeypatch.setattr("deploy.supervisor.HUNG_KILLED_S", 3.0)
     run_dir = tmp_path / "run"
-    results, said = disturbed(run_dir, {(0, 0): lambda: os.kill(process_of(run_dir, "perception"), signal.SIGSTOP)})
+    results, said = disturbed(
+        run_dir, {(0, 0): lambda: os.kill(processes_of(run_dir)["perception"], signal.SIGSTOP)})
     assert_as_if_nothing_had_happened(run_dir, results)
     assert [text.split(":")[0] for text in said][:3] == [
         "perception hangs", "perception is ended", "perception is started again"]
@@ -124,7 +115,7 @@ def test_a_launcher_that_was_suspended_blames_nobody(tmp_path):
     launcher = subprocess.Popen([sys.executable, "-m", "tests.fakes.launch", str(run_dir), "1", "3000"],
                                 stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     try:
-        while process_of(run_dir, "recorder") is None:
+        while "recorder" not in processes_of(run_dir):
             time.sleep(0.05)
         time.sleep(1.5)
         os.kill(launcher.pid, signal.SIGSTOP)
@@ -144,7 +135,7 @@ def test_the_shipped_agent_ends_where_it_would_have_ended(tmp_path):
 
     def kill(topic, part, message):
         if topic == FRAME and (name := moments.pop(message.step, None)):
-            os.kill(process_of(run_dir, name), signal.SIGKILL)
+            os.kill(processes_of(run_dir)[name], signal.SIGKILL)
 
     launch(config, run_dir, kill, say=lambda text: None)
     assert not moments

@@ -8,10 +8,8 @@ from pathlib import Path
 from deploy.logs.source import whole
 from shared.errors import SaccadeError
 from shared.reading import Recorded, RunReader
-from shared.recording import ENDED_EARLY, LOG, RecordingStopped, RunLog
+from shared.recording import CUT, ENDED_EARLY, LOG, RecordingStopped, RunLog
 from shared.wire import MessageError, decode
-
-CUT = "cut"  # metadata of a log that was cut out of another: which steps it has
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 from deploy.launch import PROCESSES, launch
@@ -13,6 +14,17 @@ from shared.errors import SaccadeError
 REAL = ("router", "recorder")
 FAKES = tuple(p if p.name in REAL else Process(p.name, f"tests.fakes.{p.name}") for p in PROCESSES)
 PARTS = ("mug", "can")
+
+
+def processes_of(run_dir: Path) -> dict[str, int]:
+    """Process ids of the services that run on this folder's configuration, by name."""
+    found = {}
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        with suppress(OSError):
+            words = path.read_text(errors="replace").split("\0")
+            if f"{run_dir}/config.json" in words and "-m" in words:
+                found[words[words.index("-m") + 1].rsplit(".", 1)[-1]] = int(path.parent.name)
+    return found
 
 
 def configuration(episodes: int, steps: int, wish: str = "") -> Config:
