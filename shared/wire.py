@@ -49,7 +49,7 @@ def _unpack_array(code: int, data: bytes) -> np.ndarray:
         raise MessageError("an array's header is not [dtype, shape]")
     dtype = np.dtype("<" + header[0]) if header[0] != "u1" else np.dtype("u1")
     start = unpacker.tell()
-    if len(data) - start != dtype.itemsize * int(np.prod(header[1], dtype=object)):
+    if len(data) - start != dtype.itemsize * math.prod(header[1]):
         raise MessageError("an array's bytes do not fill its shape")
     return np.frombuffer(data, dtype, offset=start).reshape(header[1])
 

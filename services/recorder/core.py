@@ -16,6 +16,7 @@ from pathlib import Path
 from shared.bus import Bus, ZenohBus
 from shared.config import Config
 from shared.errors import SaccadeError
+from shared.messages import Message
 from shared.outbox import KEPT_BYTES
 from shared.process import Health, Heartbeat, Inbox, Item, run_process
 from shared.provenance import commit
@@ -23,7 +24,7 @@ from shared.reading import RunReader
 from shared.recording import CUT, FLUSH_S, RecordingStopped, RunLog
 from shared.sequences import Sequences
 from shared.topics import TOPICS, Topic
-from shared.wire import MessageError, decode, stamp_of
+from shared.wire import MessageError, decode
 
 NAME = "recorder"
 LOG_NAME = "run.mcap"
@@ -121,16 +122,15 @@ class Recorder:
             run = reader.metadata.get("run", {}).get("run")
             if run != self._run:
                 raise SaccadeError(f"log {log.path} is there already, of the run {run}: move it away")
-            self._write(log, topic, part, payload, time_ns)
+            self._write(log, topic, part, payload, self._checked(topic, part, payload), time_ns)
         log.flush()
 
     def _take(self, topic: Topic, part: str | None, payload: bytes) -> None:
         self.health.received += 1
-        with contextlib.suppress(MessageError):
-            stamp = stamp_of(payload)
-            if stamp.run == self._run and self._sequences.begins(topic, part, stamp):
-                self._write_kept([topic], self._last[topic.name, part])  # how the last episode ended may be lost
-        self._write(self.log, topic, part, payload)
+        message = self._checked(topic, part, payload)
+        if message is not None and message.run == self._run and self._sequences.begins(topic, part, message):
+            self._write_kept([topic], self._last[topic.name, part])  # how the last episode ended may be lost
+        self._write(self.log, topic, part, payload, message)
         self.health.published = self.log.messages
         self._ask_for_missing()
 
@@ -155,22 +155,28 @@ class Recorder:
     def _write_kept(self, topics: Sequence[Topic], since: tuple[int, int]) -> None:
         kept = self._bus.recall(topics, (self._run, *since), KEPT_BYTES)
         for topic, part, payload, _, published_ns in sorted(kept, key=lambda k: k.published_ns):
-            self._write(self.log, topic, part, payload, published_ns)
+            self._write(self.log, topic, part, payload, self._checked(topic, part, payload), published_ns)
 
-    def _write(self, log: RunLog, topic: Topic, part: str | None, payload: bytes, time_ns: int | None = None) -> None:
-        sequence = 0
+    def _checked(self, topic: Topic, part: str | None, payload: bytes) -> Message | None:
+        """The whole message: what is none must not take the number of one. It is recorded all the same: the log is
+        what was on the wire."""
         try:
-            message = decode(topic.type, payload)  # whole: what is no message must not take the number of one
+            return decode(topic.type, payload)
+        except MessageError as error:
+            self.health.refuse(topic, part, error)
+            return None
+
+    def _write(self, log: RunLog, topic: Topic, part: str | None, payload: bytes, message: Message | None,
+               time_ns: int | None = None) -> None:
+        if message is not None:
             if (lost := self._sequences.take(topic, part, message)) is None:
                 return
             if lost and time_ns is None:  # what came before it stands before it
                 self._ask_for_missing()
-            sequence, key = message.seq, (topic.name, part)
             if topic.in_step and message.run == self._run:
+                key = topic.name, part
                 self._last[key] = max(self._last.get(key, (0, 0)), (message.episode, message.step))
-        except MessageError as error:  # recorded all the same: the log is what was on the wire
-            self.health.refuse(topic, part, error)
-        log.write(topic, part, payload, sequence=sequence, log_time_ns=time_ns)
+        log.write(topic, part, payload, sequence=message.seq if message else 0, log_time_ns=time_ns)
 
 
 def describe(config: Config, run: str) -> dict[str, dict[str, str]]:
