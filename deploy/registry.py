@@ -109,7 +109,7 @@ def weight_hashes(agent: str, config: Config) -> dict[str, str]:
     """
     if not agent_of(agent).weights:
         return {}
-    from shared.weights import Weights  # loads torch
+    from shared.weights import Weights
 
     weights = Weights(config.weights)
     weights.cards_of(config.scene.names or ())

@@ -1,25 +1,25 @@
 """The cortical column network (CCN): one small generative model per object (paper, section 3.2 and appendix C).
 
 A crop o is encoded into q(p | o), a Gaussian over the object's latent pose; p(p' | p, a) moves it by a displacement in
-azimuth and elevation; p(o | p) draws it. Perception encodes, belief and planner transition: so it lives here.
+azimuth and elevation; p(o | p) draws it. Perception encodes, belief moves (in NumPy: `shared/latent.py`), training does
+both: so it lives here.
 There are two architectures: "paper" is the paper's tables to the letter, "default" is what departs from them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.func import functional_call, stack_module_state
 
+from shared.latent import MIN_STD
+from shared.weights import Architecture
+
 LATENT = 8
 CROP_PX = 64
-MIN_STD = 1e-3
-
-Architecture = Literal["default", "paper"]
 
 
 def conv_stack(channels_in: int, width: int) -> nn.Sequential:

@@ -10,16 +10,18 @@ import hashlib
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
-import torch
-from numpy.typing import NDArray
-from safetensors.torch import load, save
-from torch import Tensor, nn
+from numpy.typing import ArrayLike, NDArray
+from safetensors.numpy import load, save
 
 from shared.errors import SaccadeError
-from shared.generative_model import Architecture
+
+if TYPE_CHECKING:
+    from torch import nn
+
+Architecture = Literal["default", "paper"]
 
 MANIFEST = "manifest.json"
 MAX_FILE_BYTES = 64 * 1024 * 1024
@@ -73,8 +75,9 @@ class Weights:
                 raise SaccadeError(f"object {name!r} has no weights in {self.folder}: train it with `saccade train`")
         return tuple(known[name] for name in names)
 
-    def state(self, stem: str) -> dict[str, Tensor]:
-        """The tensors of `<stem>.safetensors` in single precision, after its hash was checked."""
+    def state(self, stem: str, prefix: str = "") -> dict[str, NDArray[np.float32]]:
+        """Those arrays of `<stem>.safetensors` whose names begin with `prefix`, without it, after the file's hash was
+        checked."""
         path = self.folder / f"{stem}.safetensors"
         if not path.is_file():
             raise SaccadeError(f"weights {path} are missing: get them again or train anew")
@@ -83,25 +86,27 @@ class Weights:
         data = path.read_bytes()
         if hashlib.sha256(data).hexdigest() != self.hashes.get(path.name):
             raise SaccadeError(f"weights {path} do not match the hash in {MANIFEST}: get them again or train anew")
-        return {key: tensor.float() for key, tensor in load(data).items()}
+        return {key.removeprefix(prefix): array.astype(np.float32) for key, array in load(data).items()
+                if key.startswith(prefix)}
 
     def fill(self, module: nn.Module, stem: str, prefix: str = "") -> nn.Module:
-        """Loads the tensors of `stem` whose names begin with `prefix` into a module and returns it."""
-        state = {key.removeprefix(prefix): value for key, value in self.state(stem).items() if key.startswith(prefix)}
+        """Loads `state(stem, prefix)` into a torch module and returns it."""
+        import torch  # here: belief and planner need the cards and arrays alone
+
         try:
-            module.load_state_dict(state)
+            module.load_state_dict({key: torch.from_numpy(array) for key, array in self.state(stem, prefix).items()})
         except RuntimeError as error:
             raise SaccadeError(f"weights {self.folder / stem} are of another architecture: train anew") from error
         return module.eval()
 
 
-def write_weights(folder: Path, states: dict[str, dict[str, Tensor]], cards: tuple[ObjectCard, ...],
+def write_weights(folder: Path, states: dict[str, dict[str, ArrayLike]], cards: tuple[ObjectCard, ...],
                   facts: dict) -> None:
     """Writes the states in half precision and the manifest with their hashes."""
     folder.mkdir(parents=True, exist_ok=True)
     hashes = {}
     for stem, state in states.items():
-        data = save({key: value.detach().to(torch.float16).contiguous() for key, value in state.items()})
+        data = save({key: np.asarray(value).astype(np.float16, order="C") for key, value in state.items()})
         (folder / f"{stem}.safetensors").write_bytes(data)
         hashes[f"{stem}.safetensors"] = hashlib.sha256(data).hexdigest()
     objects = {card.name: {"size_m": [round(float(x), 6) for x in card.size_m], "crop_side_m": card.crop_side_m}

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import torch
 
 from services.belief.pose import GoalView
 from services.belief.position import PositionFilter, behind, beyond_nearest, evidence_of
@@ -122,20 +121,19 @@ def test_the_filter_leaves_numpys_global_state_alone():
     assert (np.random.get_state()[1] == expected).all()
 
 
-class Turning(torch.nn.Module):
+class Turning:
     """A transition that is right by construction: the latent is (cos, sin, elevation) of the viewing direction, and
     seen through `folds` every view looks as `folds` others do."""
 
     def __init__(self, folds: int):
-        super().__init__()
         self.folds = folds
 
-    def forward(self, latent, displacement):
-        angle = torch.atan2(latent[:, 1], latent[:, 0]) + self.folds * displacement[:, 0]
-        moved = torch.zeros_like(latent)
-        moved[:, 0], moved[:, 1] = angle.cos(), angle.sin()
-        moved[:, 2] = latent[:, 2] + displacement[:, 1]
-        return moved, torch.full_like(moved, 0.15)
+    def __call__(self, latent, displacement):
+        angle = np.arctan2(latent[1], latent[0]) + self.folds * displacement[:, 0]
+        moved = np.zeros((len(displacement), len(latent)), dtype=np.float32)
+        moved[:, 0], moved[:, 1] = np.cos(angle), np.sin(angle)
+        moved[:, 2] = latent[2] + displacement[:, 1]
+        return moved, np.full_like(moved, 0.15)
 
 
 def latent_of(azimuth, elevation, folds=1):

@@ -1,10 +1,23 @@
 """The CCN's parts: shapes, densities, and the batched evaluation of K networks against a loop over them."""
 
+import numpy as np
 import pytest
 import torch
 
 from services.perception.networks import CELLS, MASK_PX, Extraction, Identity, tally
-from shared.generative_model import CCN, LATENT, Encoder, Stacked, Transition, kl_divergence, log_density
+from shared import latent
+from shared.config import REPOSITORY
+from shared.generative_model import (
+    CCN,
+    LATENT,
+    Encoder,
+    Stacked,
+    Transition,
+    kl_divergence,
+    log_density,
+    transition_of,
+)
+from shared.weights import Weights
 
 
 @pytest.mark.parametrize("count", [1, 2, 5])
@@ -43,6 +56,25 @@ def test_gaussian_formulas_equal_those_of_torch():
     torch.testing.assert_close(log_density(x, mean, std), p.log_prob(x).sum(-1))
     expected = torch.distributions.kl_divergence(p, q).sum(-1)
     torch.testing.assert_close(kl_divergence(mean, std, other, other_std), expected)
+
+
+@pytest.mark.parametrize("folder", ["pantry", "ycb", "ycb-paper"])
+def test_what_belief_does_in_numpy_is_what_was_trained_in_torch(folder):
+    weights = Weights(REPOSITORY / "weights" / folder)
+    name = weights.names[0]
+    network = weights.fill(transition_of(weights.architecture), name, latent.PREFIX)
+    rng = np.random.default_rng(0)
+    start, goal = (rng.normal(size=LATENT).astype(np.float32) for _ in range(2))
+    moves = rng.uniform(-3, 3, (200, 2)).astype(np.float32)
+    mean, std = latent.LatentTransition(weights, name)(start, moves)
+    with torch.inference_mode():
+        expected = network(torch.from_numpy(start).expand(200, -1), torch.from_numpy(moves))
+    for ours, theirs in zip((mean, std), expected, strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(latent.log_density(goal, mean, std), log_density(torch.from_numpy(goal), *expected),
+                               rtol=1e-3)
+    prior = (np.zeros_like(mean), np.ones_like(std))
+    np.testing.assert_allclose(latent.kl_divergence((mean, std), prior), kl_divergence(*expected, 0.0, 1.0), rtol=1e-3)
 
 
 def test_votes_of_the_cells_that_see_the_object_decide():

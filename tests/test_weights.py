@@ -10,6 +10,7 @@ from services.perception.networks import Identity
 from shared.config import REPOSITORY
 from shared.errors import SaccadeError
 from shared.generative_model import CCN, Transition
+from shared.latent import PREFIX, LatentTransition
 from shared.weights import MANIFEST, ObjectCard, Weights, write_weights
 
 SHIPPED = [REPOSITORY / "weights" / name for name in ("pantry", "ycb")]
@@ -51,6 +52,13 @@ def test_missing_manifest_file_and_object_are_told(folder):
     (folder / MANIFEST).unlink()
     with pytest.raises(SaccadeError, match="saccade train"):
         Weights(folder)
+
+
+def test_a_transition_of_another_shape_is_told(tmp_path):
+    state = {f"{PREFIX}layers.0.weight": np.zeros((4, 11)), f"{PREFIX}layers.0.bias": np.zeros(4)}
+    write_weights(tmp_path, {"mug": state}, (ObjectCard("mug", np.ones(3), 0.16),), {})
+    with pytest.raises(SaccadeError, match="mug are of another architecture"):
+        LatentTransition(Weights(tmp_path), "mug")
 
 
 @pytest.mark.parametrize("text", ["{", "[]", '{"objects": {"mug": {}}, "sha256": {}}', '{"objects": {}}'])

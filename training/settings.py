@@ -9,7 +9,7 @@ from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, mod
 
 from shared.config import Section, checked
 from shared.errors import SaccadeError
-from shared.generative_model import Architecture
+from shared.weights import Architecture
 
 EXTRACTION = "extraction"
 # What holds for the paper's networks unless told otherwise: its batches and rates (appendix C), but fewer steps: its

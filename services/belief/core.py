@@ -11,7 +11,7 @@ from services.belief.free_energy import crop_term, identity_term, likelihood_ter
 from services.belief.pose import GoalView
 from services.belief.position import PositionFilter, evidence_of
 from shared.config import Config
-from shared.generative_model import transition_of
+from shared.latent import LatentTransition
 from shared.messages import Belief, Percept
 from shared.seeding import generator
 from shared.service import Inputs, Output, Service
@@ -33,8 +33,7 @@ class BeliefFilter:
         self.config, self.names = config, names
         weights = Weights(config.weights)
         self.radius_m = {card.name: card.radius_m for card in weights.cards_of(names)}
-        self.transitions = {name: weights.fill(transition_of(weights.architecture), name, "ccn.transition.")
-                            for name in names}
+        self.transitions = {name: LatentTransition(weights, name) for name in names}
 
     def begin(self, run: str, episode: int) -> Iterable[Output]:
         """A new scene: nothing is known."""

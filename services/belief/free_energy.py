@@ -7,11 +7,10 @@ much each image still surprises, and falls as the belief sharpens.
 from __future__ import annotations
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from shared.generative_model import Transition, kl_divergence
 from shared.geometry import project, spherical, wrap
+from shared.latent import LatentTransition, kl_divergence
 from shared.messages import Percept
 
 Array = NDArray[np.float64]
@@ -60,18 +59,17 @@ def crop_term(percept: Percept, before: tuple[Array, Array]) -> float:
     return where + scale
 
 
-@torch.inference_mode()
-def pose_term(percept: Percept, before: Percept | None, center: Array, transition: Transition) -> float:
+def pose_term(percept: Percept, before: Percept | None, center: Array, transition: LatentTransition) -> float:
     """KL[Q(p | o) || P(p | p_before, a)]: the latent as seen, against the one before moved by the camera's displacement
     around the object at `center` [3]; against a standard normal where there is none."""
-    seen = torch.from_numpy(np.array(percept.latent_mean)), torch.from_numpy(np.array(percept.latent_std))
+    seen = percept.latent_mean, percept.latent_std
     if before is None:
-        return float(kl_divergence(*seen, 0.0, 1.0))
+        return float(kl_divergence(seen, (0.0, 1.0)))
     azimuth, elevation, _ = spherical(percept.world_from_camera[:3, 3], center)
     azimuth_0, elevation_0, _ = spherical(before.world_from_camera[:3, 3], center)
-    displacement = torch.tensor([[float(wrap(azimuth - azimuth_0)), float(elevation - elevation_0)]])
-    mean, std = transition(torch.from_numpy(np.array(before.latent_mean))[None], displacement)
-    return float(kl_divergence(*seen, mean[0], std[0]))
+    displacement = np.array([[wrap(azimuth - azimuth_0), elevation - elevation_0]])
+    mean, std = transition(before.latent_mean, displacement)
+    return float(kl_divergence(seen, (mean[0], std[0])))
 
 
 def likelihood_term(percept: Percept) -> float:

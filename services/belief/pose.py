@@ -10,11 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from shared.config import BeliefConfig
-from shared.generative_model import Transition, log_density
 from shared.geometry import (
     GRID_AZIMUTHS,
     GRID_ELEVATIONS,
@@ -25,6 +23,7 @@ from shared.geometry import (
     viewing_grid,
     wrap,
 )
+from shared.latent import LatentTransition, log_density
 from shared.messages import Percept
 
 Array = NDArray[np.float64]
@@ -43,7 +42,7 @@ class Keyframe:
     """A view that is kept: from where, what the latent was, and its log likelihood over the grid [E, A]."""
 
     eye: Array
-    mean: torch.Tensor
+    mean: NDArray[np.float32]
     quality: float
     range_m: float  # as the percept has it
     log_likelihood: Array
@@ -52,10 +51,10 @@ class Keyframe:
 class GoalView:
     """The posterior of one object."""
 
-    def __init__(self, config: BeliefConfig, transition: Transition, goal: Percept):
+    def __init__(self, config: BeliefConfig, transition: LatentTransition, goal: Percept):
         self.config, self.transition = config, transition
-        self.goal_mean = torch.from_numpy(np.array(goal.latent_mean))
-        self.goal_std = torch.from_numpy(np.array(goal.latent_std))
+        self.goal_mean = np.array(goal.latent_mean)
+        self.goal_std = np.array(goal.latent_std)
         self.measured_range_m = REFERENCE_RANGE_M / goal.scale
         elevation, azimuth = viewing_grid()
         self.elevation, self.azimuth = (x.ravel() for x in np.meshgrid(elevation, azimuth, indexing="ij"))
@@ -79,16 +78,16 @@ class GoalView:
         self.keyframes = [k for k in self.keyframes if all(k is not other for other in near)]
         if len(self.keyframes) >= self.config.keyframes:
             self.keyframes.remove(min(self.keyframes, key=lambda k: k.quality))
-        mean = torch.from_numpy(np.array(percept.latent_mean))
+        mean = np.array(percept.latent_mean)
         self.keyframes.append(Keyframe(np.array(eye), mean, quality, REFERENCE_RANGE_M / percept.scale,
                                        self._likelihood(eye, mean)))
 
     def here(self, percept: Percept) -> float:
         """Share of the present view's say that falls to the directions around its own."""
         eye = percept.world_from_camera[:3, 3]
-        mean = torch.from_numpy(np.array(percept.latent_mean))
+        mean = percept.latent_mean
         last = self.keyframes[-1]
-        kept = np.array_equal(last.eye, eye) and torch.equal(last.mean, mean)
+        kept = np.array_equal(last.eye, eye) and np.array_equal(last.mean, mean)
         share = np.exp(last.log_likelihood if kept else self._likelihood(eye, mean)).ravel()
         near = direction(self.azimuth, self.elevation) @ unit(eye - self.center) > np.cos(HERE_RAD)
         # near the pole the azimuth turns the image: only what is turned as seen from here counts
@@ -97,14 +96,12 @@ class GoalView:
         upright = (elevation < np.pi / 2 - 3 * HERE_RAD) | (np.abs(wrap(self.azimuth - azimuth)) < TURNED_RAD)
         return float(share[near & turned & upright].sum())
 
-    @torch.inference_mode()
-    def _likelihood(self, eye: Array, mean: torch.Tensor) -> Array:
+    def _likelihood(self, eye: Array, mean: NDArray[np.float32]) -> Array:
         """log of the share of each cell in one view's say [E, A], with a floor for views that are wrong."""
         azimuth, elevation, _ = spherical(eye, self.center)
         displacement = np.stack([wrap(self.azimuth - azimuth), self.elevation - elevation], axis=-1)
-        moved_mean, moved_std = self.transition(mean.expand(len(displacement), -1),
-                                                torch.as_tensor(displacement, dtype=torch.float32))
-        score = log_density(self.goal_mean, moved_mean, (moved_std ** 2 + self.goal_std ** 2).sqrt()).double().numpy()
+        moved_mean, moved_std = self.transition(mean, displacement)
+        score = log_density(self.goal_mean, moved_mean, np.sqrt(moved_std ** 2 + self.goal_std ** 2)).astype(np.float64)
         share = np.exp(score - score.max())
         share = (1 - OUTLIER) * share / share.sum() + OUTLIER / len(share)
         return np.log(share).reshape(GRID_ELEVATIONS, GRID_AZIMUTHS)

@@ -1,0 +1,24 @@
+"""What a service's process loads: its own dependencies and no more."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+HEAVY = {"torch", "mujoco", "scipy", "filterpy", "cv2", "matplotlib", "typer", "rich"}
+NEEDS = {
+    "router": set(), "recorder": set(), "evaluator": set(),
+    "simulator": {"mujoco"},
+    "perception": {"torch"},
+    "belief": {"filterpy", "scipy"},
+    "planner": {"scipy"},
+}
+
+
+@pytest.mark.parametrize("name", NEEDS)
+def test_a_process_loads_what_its_service_needs_and_no_more(name):
+    code = f"import sys, services.{name}.__main__; print(*sorted({HEAVY} & set(sys.modules)))"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert set(loaded.split()) <= NEEDS[name]
