@@ -51,7 +51,7 @@ def launch(config: Config, run_dir: Path, on_message: OnMessage | None = None,
     config = resolve(config, processes)
     wanted = topics if on_message else ()
     with running(config, run_dir, processes, wanted if wanted is None else {*wanted, *FOLLOWED}, say) as graph:
-        results = _follow(graph, processes, on_message)
+        results = follow(graph, processes, on_message)
         graph.supervisor.stop()
         _drain(graph.messages, on_message)
         for complaint in graph.supervisor.complaints():  # what went wrong beside the results, such as a full disk
@@ -85,11 +85,11 @@ def running(config: Config, run_dir: Path, processes: Sequence[Process], topics:
         bus = ZenohBus(config.bus.endpoint, world=config.bus.world)
         stack.callback(bus.close)
         bus.subscribe(topics, lambda *item: arrived.put(item))
-        messages = _messages(arrived, bus, supervisor, config.run or run_dir.name)
-        _await_router(messages, processes[0])
+        stream = messages(arrived, bus, supervisor, config.run or run_dir.name)
+        _await_router(stream, processes[0])
         for process in processes[1:]:
             supervisor.start(process)
-        yield Graph(bus, supervisor, messages)
+        yield Graph(bus, supervisor, stream)
 
 
 def resolve(config: Config, processes: Sequence[Process] = PROCESSES) -> Config:
@@ -108,7 +108,7 @@ def _prepare(run_dir: Path) -> None:
         raise SaccadeError(f"run folder {run_dir} cannot be made: {error.strerror}") from error
 
 
-def _messages(arrived: queue.SimpleQueue, bus: Bus, supervisor: Supervisor, run: str) -> Iterator:
+def messages(arrived: queue.SimpleQueue, bus: Bus, supervisor: Supervisor, run: str) -> Iterator:
     """(topic, part, message) as they arrive, each once, and None when nothing did."""
     sequences, looked_s, news_s = Sequences(), time.monotonic(), time.monotonic()
     while True:
@@ -141,7 +141,7 @@ def _await_router(messages: Iterator, router: Process) -> None:
             raise SaccadeError(f"{router.name}: not ready after {READY_S:.0f} s; see {LOGS_NAME}/")
 
 
-def _follow(graph: Graph, processes: Sequence[Process], on_message: OnMessage | None) -> list[Result]:
+def follow(graph: Graph, processes: Sequence[Process], on_message: OnMessage | None) -> list[Result]:
     starting = {process.name for process in processes[1:]}
     course = _Course(processes[1].name, judged=JUDGE in starting)
     over_s, deadline_s = None, time.monotonic() + READY_S

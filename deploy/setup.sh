@@ -12,7 +12,7 @@ if [ ! -x .venv/bin/python ] && ! "$python" -m venv .venv; then
     echo "saccade: '$python -m venv' failed: install it (Debian, Ubuntu: apt-get install python3-venv)" >&2
     exit 2
 fi
-.venv/bin/python -m pip install --quiet --editable .
+.venv/bin/python -m pip install --quiet --editable '.[all]'
 
 has_opengl() { .venv/bin/python -c 'from services.simulator.opengl import choose_backend; choose_backend()' 2>/dev/null; }
 

@@ -28,6 +28,7 @@ class BusConfig(Section):
 
     kind: Literal["zenoh", "local"] = "zenoh"
     endpoint: str = "tcp/127.0.0.1:0"  # port 0: the launcher picks a free one
+    listen: str | None = None  # where the router listens, if others know it by another address
     world: str = Field("table", pattern=r"^[A-Za-z0-9_-]{1,64}$")
     wait_for: tuple[str, ...] = ()  # services that must be ready before the source begins; the launcher fills it in
     live: bool = False  # nobody waits: each service takes the newest step and says what it skipped

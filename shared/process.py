@@ -30,6 +30,7 @@ EXIT_ERROR = 2
 NOTE_LENGTH = 1000
 REFUSED = "refused: "
 STARTING = "starting"
+HEARTBEAT_VARIABLE = "SACCADE_HEARTBEAT"  # a file for whoever is not on the bus: its age and the state in it
 LAUNCHER_VARIABLE = "SACCADE_LAUNCHER"  # the launcher's process id: the service stops if that is no longer its parent
 
 Item = tuple[Topic, str | None, bytes]
@@ -130,7 +131,7 @@ class Heartbeat:
         self._bus, self._health, self._on_orphaned = bus, health, on_orphaned
         self._stop = threading.Event()
         self._seq = 0
-        self._parent = os.environ.get(LAUNCHER_VARIABLE)
+        self._parent, self._file = os.environ.get(LAUNCHER_VARIABLE), os.environ.get(HEARTBEAT_VARIABLE)
         self._thread = threading.Thread(target=self._run, name="heartbeat", daemon=True)
 
     def __enter__(self) -> Heartbeat:
@@ -153,6 +154,9 @@ class Heartbeat:
                 self._on_orphaned()
 
     def _publish(self) -> None:
+        if self._file:
+            with contextlib.suppress(OSError):  # whoever reads it sees that it grows old
+                Path(self._file).write_text(self._health.state)
         self._bus.publish(STATUS, self._health.service, encode(self._health.status(self._seq)))
         self._seq += 1
 

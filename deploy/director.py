@@ -1,0 +1,184 @@
+"""`python -m deploy.director`: prepares a run for services that something else starts, such as Docker; follows it and
+says how it ended.
+
+It writes the configuration of each world into a new folder in SACCADE_RUNS, which every service reads, and at the end a
+file that tells them that it is over.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import queue
+import shlex
+import signal
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from deploy.container import LATEST, OVER, heartbeat_file, runs_folder
+from deploy.display import LINE_EVERY, Progress, line
+from deploy.ending import ending
+from deploy.launch import LOG_NAME, Graph, follow, messages, resolve
+from deploy.options import configured
+from deploy.registry import agent_processes
+from deploy.supervisor import CONFIG_NAME, HUNG_S, Process
+from shared.bus import ZenohBus
+from shared.config import REPOSITORY, Config, load
+from shared.errors import SaccadeError
+from shared.messages import Message, Result
+from shared.process import EXIT_ERROR
+from shared.topics import BELIEF, PLAN, RESULT, STATUS, TRUTH, Topic
+
+SHOWN = (TRUTH, PLAN, BELIEF, STATUS, RESULT)
+BEAT_S = 0.5
+ROUTER_S = 60.0  # containers start one after the other
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Exit code 2, with one line, where the run cannot be prepared or does not come to its end."""
+    parser = argparse.ArgumentParser(prog="python -m deploy.director", description=__doc__.splitlines()[0])
+    parser.add_argument("--endpoint", default="tcp/127.0.0.1:7447", help="the router's address, for the services")
+    parser.add_argument("--listen", help="where the router listens, if that is another one")
+    parser.add_argument("--objects", default=None, help="object set: pantry, ycb")
+    parser.add_argument("--weights", default=None, help="a folder of weights, or its name in weights/")
+    parser.add_argument("--seed", type=int, default=None)
+    parser.add_argument("--count", type=int, default=None, help="scenes, one after the other")
+    parser.add_argument("--worlds", type=int, default=1, help="scenes at once")
+    parser.add_argument("--set", default="", metavar="'KEY=VALUE ...'", help="configuration by dotted keys")
+    told = parser.parse_args(argv)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+    try:
+        given = {"bus.endpoint": told.endpoint, "bus.listen": told.listen, "scene.objects": told.objects,
+                 "perception.weights": weights_of(told.weights), "seed": told.seed, "scene.count": told.count}
+        direct(configured(None, given, shlex.split(told.set)), told.worlds, runs_folder(), Console(width=200))
+    except SaccadeError as error:
+        print(f"saccade: {error}", file=sys.stderr)
+        sys.exit(EXIT_ERROR)
+
+
+def weights_of(name: str | None) -> Path | None:
+    """A folder, or one in weights/."""
+    if not name:
+        return None
+    return Path(name) if "/" in name else REPOSITORY / "weights" / name
+
+
+def direct(config: Config, worlds: int, runs: Path, console: Console) -> list[Result]:
+    """Prepares a run and follows it to its end: the results of all its worlds. Raises SaccadeError where it cannot."""
+    processes = agent_processes("sceneccn")
+    folders = prepare(resolve(config, processes), worlds, runs)
+    with _Beating():
+        console.print(f"run {folders[0].parent.name if worlds > 1 else folders[0].name}: waits for its services")
+        with ThreadPoolExecutor(worlds) as pool:
+            found = list(pool.map(lambda folder: _follow(folder, processes, console, worlds), folders))
+    for folder in folders:
+        (folder / OVER).touch()
+    return [result for results in found for result in results]
+
+
+def prepare(config: Config, worlds: int, runs: Path) -> list[Path]:
+    """Writes the worlds' configurations into a new folder of `runs`, and has `latest` point there. Raises SaccadeError
+    where that cannot be written."""
+    if worlds < 1:
+        raise SaccadeError(f"{worlds} worlds: it takes one at least")
+    run = runs / f"{time.strftime('%Y%m%d-%H%M%S')}-{config.seed}"
+    folders = [run / f"{config.bus.world}-{k}" for k in range(worlds)] if worlds > 1 else [run]
+    try:
+        for k, folder in enumerate(folders):
+            folder.mkdir(parents=True)
+            values: dict[str, Any] = {"run": run.name, "seed": config.seed + k}
+            if worlds > 1:
+                values |= {"run": f"{run.name}-{folder.name}", "bus.world": folder.name}
+            config.with_values(values).save(folder / CONFIG_NAME)
+        pointer = runs / f".{LATEST}"
+        pointer.unlink(missing_ok=True)
+        pointer.symlink_to(run.name)
+        pointer.replace(runs / LATEST)
+    except OSError as error:
+        raise SaccadeError(f"{runs} cannot be written by user {os.getuid()} ({error.strerror}): let its owner's number "
+                           "be SACCADE_UID, or give the folder to that user") from error
+    return folders
+
+
+def _follow(folder: Path, processes: Sequence[Process], console: Console, worlds: int) -> list[Result]:
+    config = load(folder / CONFIG_NAME)
+    prefix = f"{config.bus.world}: " if worlds > 1 else ""
+    progress, arrived = Progress(), queue.SimpleQueue()
+
+    def say(text: str) -> None:
+        console.print(prefix + text, markup=False, highlight=False, soft_wrap=True)
+
+    def on_message(topic: Topic, part: str | None, message: Message) -> None:
+        progress.take(topic, part, message)
+        if topic == TRUTH and message.step % LINE_EVERY == 0:
+            say(line(progress))
+
+    with closing(ZenohBus(config.bus.endpoint, world=config.bus.world, timeout_s=ROUTER_S)) as bus:
+        bus.subscribe(SHOWN, lambda *item: arrived.put(item))
+        elsewhere = Elsewhere([process.name for process in processes], say)
+        graph = Graph(bus, elsewhere, messages(arrived, bus, elsewhere, config.run))
+        results = follow(graph, processes, on_message)
+    for text in ending(config, results, progress):
+        say(text)
+    say(f"log: {folder / LOG_NAME}")
+    return results
+
+
+class Elsewhere:
+    """In the supervisor's place where others start the services: it hears them, and names those that fall silent."""
+
+    def __init__(self, names: Sequence[str], say) -> None:
+        self.stopped = False
+        self._names, self._say = frozenset(names), say
+        self._heard_s: dict[str, float] = {}
+        self._silent: set[str] = set()
+
+    def heard(self, name: str, state: str) -> None:
+        """A heartbeat has come."""
+        if name in self._silent and name in self._names:
+            self._silent.discard(name)
+            self._say(f"{name} is heard again")
+        self._heard_s[name] = time.monotonic()
+
+    def check(self) -> None:
+        """Names who was heard and is not any more."""
+        for name, at_s in self._heard_s.items():
+            if name in self._names and name not in self._silent and time.monotonic() - at_s > HUNG_S:
+                self._silent.add(name)
+                self._say(f"nothing is heard of {name} for {HUNG_S:.0f} s")
+
+    def settled(self, since_s: float) -> bool:
+        """Whether all were heard since that time."""
+        return all(self._heard_s.get(name, 0.0) > since_s for name in self._names)
+
+
+class _Beating:
+    """This process's own heartbeat."""
+
+    def __init__(self) -> None:
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="heartbeat", daemon=True)
+
+    def _run(self) -> None:
+        file = heartbeat_file("director")
+        file.write_text("ready")
+        while not self._stop.wait(BEAT_S):
+            file.touch()
+
+    def __enter__(self) -> None:
+        self._thread.start()
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+
+
+if __name__ == "__main__":
+    main()
