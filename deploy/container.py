@@ -69,12 +69,20 @@ class Container:
     def run(self) -> int:
         """Until the run is over or `stop` was called; the exit code."""
         while not self._stopping.wait(POLL_S) and not all((world / OVER).exists() for world in self._worlds):
-            codes = [child.poll() for child in self._children.values()]
-            if any(code not in (None, 0, EXIT_ERROR) for code in codes) or self._hung():
+            if self._died() or self._hung():
                 self._end()
                 return EXIT_AGAIN
         self._end()
         return EXIT_ERROR if any(child.returncode == EXIT_ERROR for child in self._children.values()) else 0
+
+    def _died(self) -> bool:
+        codes = {world: child.poll() for world, child in self._children.items()}
+        died = {world: code for world, code in codes.items() if code not in (None, 0, EXIT_ERROR)}
+        for world, code in died.items():
+            how = f"ended with code {code}" if code > 0 else f"was ended by signal {-code}"
+            hint = ": was there enough memory?" if code == -signal.SIGKILL else ""
+            print(f"saccade: {self._name} in {world.name} {how}{hint}", file=sys.stderr)
+        return bool(died)
 
     def _hung(self) -> bool:
         for world, child in self._children.items():

@@ -54,7 +54,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--worlds", type=int, default=1, help="scenes at once")
     parser.add_argument("--set", default="", metavar="'KEY=VALUE ...'", help="configuration by dotted keys")
     told = parser.parse_args(argv)
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+    signal.signal(signal.SIGTERM, lambda *_: os._exit(0))  # nothing of it is unsaved; its threads need not be waited for
     try:
         given = {"bus.endpoint": told.endpoint, "bus.listen": told.listen, "scene.objects": told.objects,
                  "perception.weights": weights_of(told.weights), "seed": told.seed, "scene.count": told.count}
@@ -128,7 +128,7 @@ def _follow(folder: Path, processes: Sequence[Process], console: Console, worlds
         results = follow(graph, processes, on_message)
     for text in ending(config, results, progress):
         say(text)
-    say(f"log: {folder / LOG_NAME}")
+    say(f"log: {Path(runs_folder().name) / folder.relative_to(runs_folder()) / LOG_NAME}")
     return results
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 
 from shared.config import REPOSITORY
@@ -10,13 +11,13 @@ WRITTEN = ("results", "docs")
 
 
 def commit() -> str:
-    """The commit of the source, with "-dirty" where it was changed since; "unknown" outside a checkout. Results and
-    documents may change: they are what runs write."""
+    """The commit of the source, with "-dirty" where it was changed since. Results and documents may change: they are what
+    runs write. Outside a checkout what SACCADE_COMMIT says, or "unknown"."""
     try:
         head = _git("rev-parse", "HEAD")
         changed = _git("status", "--porcelain", "--untracked-files=no", "--", ".", *(f":!{room}" for room in WRITTEN))
     except (OSError, subprocess.SubprocessError):
-        return "unknown"
+        return os.environ.get("SACCADE_COMMIT", "unknown")
     return head + "-dirty" * bool(changed)
 
 
