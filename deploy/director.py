@@ -54,7 +54,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--worlds", type=int, default=1, help="scenes at once")
     parser.add_argument("--set", default="", metavar="'KEY=VALUE ...'", help="configuration by dotted keys")
     told = parser.parse_args(argv)
-    signal.signal(signal.SIGTERM, lambda *_: os._exit(0))  # nothing of it is unsaved; its threads need not be waited for
+    signal.signal(signal.SIGTERM, lambda *_: os._exit(0))  # its threads wait for messages; nothing is unsaved
     try:
         given = {"bus.endpoint": told.endpoint, "bus.listen": told.listen, "scene.objects": told.objects,
                  "perception.weights": weights_of(told.weights), "seed": told.seed, "scene.count": told.count}
@@ -123,7 +123,7 @@ def _follow(folder: Path, processes: Sequence[Process], console: Console, worlds
 
     with closing(ZenohBus(config.bus.endpoint, world=config.bus.world, timeout_s=ROUTER_S)) as bus:
         bus.subscribe(SHOWN, lambda *item: arrived.put(item))
-        elsewhere = Elsewhere([process.name for process in processes], say)
+        elsewhere = Elsewhere([process.name for process in processes[1:]], say)  # the router is the first world's
         graph = Graph(bus, elsewhere, messages(arrived, bus, elsewhere, config.run))
         results = follow(graph, processes, on_message)
     for text in ending(config, results, progress):

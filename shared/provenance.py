@@ -11,8 +11,8 @@ WRITTEN = ("results", "docs")
 
 
 def commit() -> str:
-    """The commit of the source, with "-dirty" where it was changed since. Results and documents may change: they are what
-    runs write. Outside a checkout what SACCADE_COMMIT says, or "unknown"."""
+    """The commit of the source, with "-dirty" where it was changed since. Results and documents may change: they are
+    what runs write. Outside a checkout what SACCADE_COMMIT says, or "unknown"."""
     try:
         head = _git("rev-parse", "HEAD")
         changed = _git("status", "--porcelain", "--untracked-files=no", "--", ".", *(f":!{room}" for room in WRITTEN))
