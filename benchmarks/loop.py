@@ -17,7 +17,7 @@ from rich.table import Table
 from deploy.launch import PROCESSES, launch
 from deploy.registry import local_pairs
 from shared.config import Config
-from shared.loop import run_local
+from shared.local import run_local
 from shared.topics import TRUTH
 
 ROUNDS = 6

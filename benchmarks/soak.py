@@ -20,7 +20,7 @@ from deploy.logs.check import missing
 from deploy.registry import local_pairs
 from shared.config import Config
 from shared.errors import SaccadeError
-from shared.loop import run_local
+from shared.local import run_local
 from shared.reading import RunReader
 from shared.topics import ACTION, STATUS
 from shared.wire import encode

@@ -28,7 +28,7 @@ from services.simulator.core import names_in_use
 from services.simulator.scenes import Scene, load_scenes
 from shared.config import Config
 from shared.errors import SaccadeError
-from shared.loop import run_local
+from shared.local import run_local
 from shared.messages import Result
 from shared.provenance import commit
 from shared.topics import RESULT

@@ -16,7 +16,7 @@ from deploy.suites import SUITES, suite_file
 from services.simulator.scenes import Scene, load_scenes
 from shared.config import REPOSITORY, Config, validate
 from shared.errors import SaccadeError
-from shared.loop import run_local
+from shared.local import run_local
 from shared.messages import Message
 from shared.topics import Topic
 

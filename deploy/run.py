@@ -23,7 +23,7 @@ from services.recorder.core import LOG_NAME, describe
 from services.simulator.core import names_in_use
 from shared.config import Config
 from shared.errors import SaccadeError
-from shared.loop import run_local
+from shared.local import run_local
 from shared.messages import Message, Result
 from shared.recording import RecordingStopped, RunLog
 from shared.topics import Topic

@@ -21,6 +21,7 @@ from shared.wire import MAX_BYTES, MessageError, stamp_of
 
 Deliver = Callable[[Topic, str | None, bytes], None]  # runs on the bus's thread: must only put its arguments somewhere
 Answer = Callable[[Iterable[Topic], Since | None, int], list[Kept]]
+Met = Callable[[frozenset[str]], None]
 
 RECALL_S = 3.0  # for an answer to be whole: a publisher that hangs must not hang who asks it
 
@@ -42,6 +43,10 @@ class Bus(Protocol):
         """What the publishers of these topics keep from (run, episode, step) on, or of their newest episode: each
         one's messages in their order, at most about `limit_bytes` of each. Empty where nobody answers."""
 
+    def join(self, group: str, member: str, met: Met) -> None:
+        """Is a member of a group until `close`; calls `met(members)` at once and whenever one comes or goes, be it
+        killed."""
+
     def close(self) -> None:
         """Leaves the bus. May be called twice."""
 
@@ -52,6 +57,7 @@ class LocalBus:
     def __init__(self) -> None:
         self._subscribers: list[tuple[frozenset[str] | None, Deliver]] = []
         self._answers: list[tuple[frozenset[str], Answer]] = []
+        self._groups: dict[str, dict[str, Met]] = {}
 
     def publish(self, topic: Topic, part: str | None, payload: bytes) -> None:
         """Delivers at once, on the caller's thread."""
@@ -72,6 +78,25 @@ class LocalBus:
         topics = tuple(topics)
         return [kept for names, answer in list(self._answers)
                 if (asked := [t for t in topics if t.name in names]) for kept in answer(asked, since, limit_bytes)]
+
+    def join(self, group: str, member: str, met: Met) -> None:
+        """Tells everyone, on the caller's thread."""
+        self._groups.setdefault(group, {})[member] = met
+        self._tell(group)
+
+    def members(self, group: str) -> frozenset[str]:
+        """Who is in a group now."""
+        return frozenset(self._groups.get(group, ()))
+
+    def leave(self, group: str, member: str) -> None:
+        """What the end of a process does on a real bus."""
+        del self._groups[group][member]
+        self._tell(group)
+
+    def _tell(self, group: str) -> None:
+        members = self._groups[group]
+        for met in list(members.values()):
+            met(frozenset(members))
 
     def close(self) -> None:
         """Forgets the subscribers."""
@@ -95,6 +120,7 @@ class ZenohBus:
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._subscribers: list[zenoh.Subscriber] = []
         self._queryables: list[zenoh.Queryable] = []
+        self._tokens: list = []
         self._questions: queue.SimpleQueue = queue.SimpleQueue()
         self._closed = False
         self.endpoint = endpoint
@@ -170,6 +196,19 @@ class ZenohBus:
         except self._zenoh.ZError:
             return  # no router at present
 
+    def join(self, group: str, member: str, met: Met) -> None:
+        """By liveliness: a process that was killed is gone within milliseconds, one that was stopped within seconds."""
+        members, key = set(), f"{ROOT}/{self._world}/@members/{group}"
+
+        def receive(sample) -> None:
+            name = str(sample.key_expr).rsplit("/", 1)[-1]
+            (members.add if sample.kind == self._zenoh.SampleKind.PUT else members.discard)(name)
+            met(frozenset(members))
+
+        liveliness = self._session.liveliness()
+        self._tokens.append(liveliness.declare_token(f"{key}/{member}"))
+        self._subscribers.append(liveliness.declare_subscriber(f"{key}/*", receive, history=True))
+
     def close(self) -> None:
         """Undeclares before it closes: a callback left behind can keep a process from ending."""
         with self._lock:
@@ -177,7 +216,7 @@ class ZenohBus:
                 return
             self._closed = True
         self._questions.put(None)
-        for entity in (*self._subscribers, *self._queryables, *self._publishers.values()):
+        for entity in (*self._subscribers, *self._tokens, *self._queryables, *self._publishers.values()):
             entity.undeclare()
         self._session.close()
 

@@ -1,11 +1,11 @@
-"""The one main loop of every service, and the runner that drives the same cores in one process."""
+"""The one main loop of every service."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from shared.bus import Bus, ZenohBus
@@ -14,15 +14,14 @@ from shared.errors import SaccadeError
 from shared.messages import Message
 from shared.outbox import Outbox
 from shared.process import DRAIN_S, Health, Heartbeat, Inbox, run_process
+from shared.replicas import JOIN_S, MEET_S, Share, alone_on
 from shared.sequences import Sequences
 from shared.service import Core, Output, Service
-from shared.stepper import Stepper, settle
+from shared.stepper import Stepper
 from shared.ticker import Ticker
 from shared.topics import STATUS, Topic
-from shared.wire import MessageError, decode, encode
+from shared.wire import MessageError, decode, encode, stamp_of
 
-OnMessage = Callable[[Topic, str | None, Message, bytes | None], None]
-OnStep = Callable[[str, float], None]
 READY_STATES = ("ready", "busy")
 IDLE_S = 1.0  # after so long without a message a service asks for what it lacks, and says so
 WAITS = "waits for "
@@ -63,7 +62,8 @@ def serve(service: Service, core: Core, bus: Bus, parts: tuple[str, ...], *, run
     stepper = Stepper(service, core, parts, source=source, live=live, first_step=first_step)
     loop = _Loop(stepper, bus, run, wait_for if source else (), live=live)
     bus.answer(service.outputs, loop.outbox.answer)
-    bus.subscribe(loop.topics + ((STATUS,) if loop.awaited else ()), inbox.put)
+    bus.subscribe(loop.topics + ((STATUS,) if loop.awaited else ()) + loop.watched, inbox.put)
+    loop.join(inbox)
     with Heartbeat(bus, loop.health, inbox.stop):
         loop.health.say("ready", WAITS + ", ".join(sorted(loop.awaited)) if loop.awaited else loop.notes)
         loop.begin_if_due()
@@ -71,9 +71,12 @@ def serve(service: Service, core: Core, bus: Bus, parts: tuple[str, ...], *, run
         news_s = time.monotonic()
         for item in inbox.items(0.0 if source else DRAIN_S, IDLE_S, lambda: loop.wait_s):
             if item is not None:
-                loop.handle(*item, more=live and inbox.waiting)
+                loop.handle(*item, more=loop.looks_ahead and inbox.waiting)
+            elif loop.looks_ahead:
+                loop.work_off(service.trigger)
             if not inbox.stopping.is_set():
                 loop.tick_if_due()
+                loop.share_if_due()
             if item is not None and item[0] != STATUS:
                 news_s = time.monotonic()
             elif time.monotonic() - news_s >= IDLE_S:
@@ -95,17 +98,69 @@ class _Loop:
         self.notes = "\n".join(getattr(core, "notes", ()))
         self._ticker = Ticker(core.period_s) if stepper.timed else None
         self._live, self._sequences = live, Sequences()
+        self._share = Share(service, stepper.parts) if service.divisible and not live else None
+        if self._share:
+            stepper.is_due = lambda at: self._share.lacks(core.names, at)
         self._next_episode, self._closed = 0, -1
         self._end = core.episodes if self._source else 0
+
+    @property
+    def watched(self) -> tuple[Topic, ...]:
+        """What replicas of this service say: what one has answered the others need not."""
+        return self._service.outputs if self._share else ()
+
+    @property
+    def looks_ahead(self) -> bool:
+        """Whether everything that has come is looked at before a step is taken."""
+        return self._live or self._share is not None
+
+    def join(self, inbox: Inbox) -> None:
+        """Meets the replicas of this service, if it is one that can be shared. A source must be alone: raises
+        SaccadeError where another one is there."""
+        if self._share:
+            self._bus.join(self._service.name, self._share.me, lambda members: (self._share.met(members), inbox.wake()))
+            inbox.stopping.wait(MEET_S)
+            if self._share.changed:
+                inbox.stopping.wait(JOIN_S)
+                self.share_if_due()
+        elif self._source:
+            alone_on(self._bus, self._service.name)
+
+    def share_if_due(self) -> None:
+        """Takes over from a replica that is gone, gives to one that has come."""
+        if not self._share or not self._share.changed:
+            return
+        before, core = set(self._stepper.core.names), self._stepper.core
+        core.share(self._share.take_mine())
+        if set(core.names) - before:
+            self._step(None, None, self._stepper.again)
+        whole = core.names == self._stepper.parts
+        self.notes = "" if whole else f"answers for {', '.join(core.names) or 'nothing'}"
+        self.health.say(note=self.notes)
 
     def handle(self, topic: Topic, part: str | None, payload: bytes, *, more: bool = False) -> None:
         """Takes a message; runs the core for every complete step, unless there are `more` to look at first."""
         if topic == STATUS:
             self._note_status(part, payload)
             return
-        self._take(topic, part, payload)
-        while not more and self._step(topic, part, self._stepper.advance):
+        if topic in self.watched:
+            self._note_answer(topic, part, payload)
+        else:
+            self._take(topic, part, payload)
+        if not more:
+            self.work_off(topic, part)
+
+    def work_off(self, topic: Topic, part: str | None = None) -> None:
+        """Every step that is complete."""
+        while self._step(topic, part, self._stepper.advance):
             self.begin_if_due()
+
+    def _note_answer(self, topic: Topic, part: str | None, payload: bytes) -> None:
+        """Keeps what another replica said: should that one die, this one can still be asked for it."""
+        with suppress(MessageError):
+            stamp = stamp_of(payload)
+            if self._share.answered(topic, part, stamp):
+                self.outbox.keep(topic, part, stamp, payload)
 
     def _take(self, topic: Topic, part: str | None, payload: bytes) -> None:
         self.health.received += 1
@@ -150,7 +205,8 @@ class _Loop:
         others = [topic for topic in self.topics if topic not in latched and not self._live]
         while not self.awaited:
             wants = self._stepper.wants
-            kept = self._bus.recall(latched, wants and (*wants[:2], 0)) + self._bus.recall(others, wants)
+            episode = wants and (*wants[:2], 0)
+            kept = self._bus.recall((*self.watched, *latched), episode) + self._bus.recall(others, wants)
             for topic, part, payload, *_ in kept:
                 self.handle(topic, part, payload)
             if self._stepper.wants == wants:
@@ -211,6 +267,8 @@ class _Loop:
         return True
 
     def _publish(self, outputs: list[Output]) -> None:
+        if self._share:
+            outputs = [output for output in outputs if not self._share.is_answered(output)]
         encoded = []
         for output in outputs:  # all before the first is sent: a step is published as a whole or not at all
             try:
@@ -219,49 +277,7 @@ class _Loop:
                 raise MessageError(f"gives an invalid {output.topic.name}: {error}") from error
         for output, payload in zip(outputs, encoded, strict=True):
             self.outbox.keep(output.topic, output.part, output.message, payload)
+            if self._share:
+                self._share.answered(output.topic, output.part, stamp_of(payload))
             self._bus.publish(output.topic, output.part, payload)
             self.health.published += 1
-
-
-def run_local(pairs: Sequence[tuple[Service, Core]], parts: tuple[str, ...], run_id: str,
-              episodes: Iterable[int] | None = None, on_message: OnMessage | None = None, *, encoded: bool = False,
-              on_step: OnStep | None = None) -> None:
-    """Runs the cores in this process: those episodes of the source (the core with `episodes`), in rising order; or all.
-
-    `on_message(topic, part, message, payload)` sees every message in the order of publication; payload is its wire
-    bytes if `encoded`, else None, and messages pass as they are. A source that goes by time is not hurried: its next
-    frame comes when the one before it has been worked off. `on_step(service, milliseconds)` is told what each
-    step of a core took. Raises SaccadeError if a step lacks an input for good.
-    """
-    sources = [Stepper(s, c, parts, source=True) for s, c in pairs if hasattr(c, "episodes")]
-    if len(sources) != 1:
-        raise SaccadeError(f"a run needs one source, not {len(sources)}: {', '.join(s.name for s, _ in pairs)}")
-    source = sources[0]
-    steppers = [source if c is source.core else Stepper(s, c, parts) for s, c in pairs]
-    for episode in range(source.core.episodes) if episodes is None else episodes:
-        waiting = deque(source.begin(run_id, episode))
-        while waiting or (source.timed and not source.episode_done):
-            if not waiting:  # the frame before it has been worked off
-                waiting.extend(source.tick())
-                continue
-            output = waiting.popleft()
-            message = settle(output.message)
-            if on_message is not None:
-                on_message(output.topic, output.part, message, encode(message) if encoded else None)
-            for stepper in steppers:
-                if output.topic not in stepper.service.inputs:
-                    continue
-                stepper.offer(output.topic, output.part, message)
-                while (outputs := _advance(stepper, on_step)) is not None:
-                    waiting.extend(outputs)
-        if not source.episode_done:
-            lacks = [f"{s.service.name} {WAITS}{', '.join(s.waits_for())}" for s in steppers if s.waits_for()]
-            raise SaccadeError(f"episode {episode} came to a halt: {'; '.join(lacks) or 'nobody has anything to do'}")
-
-
-def _advance(stepper: Stepper, on_step: OnStep | None) -> list[Output] | None:
-    start = time.perf_counter()
-    outputs = stepper.advance()
-    if outputs is not None and on_step is not None:
-        on_step(stepper.service.name, (time.perf_counter() - start) * 1e3)
-    return outputs

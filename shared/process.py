@@ -69,6 +69,10 @@ class Inbox:
             return item
         return None
 
+    def wake(self) -> None:
+        """Has `items` give a None soon, where it has a `tick_s`."""
+        self._queue.put(None)
+
     @property
     def waiting(self) -> bool:
         """Whether something is there to be taken."""

@@ -14,15 +14,19 @@ Episode = tuple[str, int]  # run and number
 
 
 class Stamper:
-    """Numbers the messages of an episode per key, in the order in which they are made."""
+    """Numbers the messages of an episode per key, in the order in which they are made. With `first_step`, by their
+    step: of each key there is one a step, or one an episode where it is latched, whoever makes it."""
 
-    def __init__(self) -> None:
+    def __init__(self, first_step: int | None = None) -> None:
         self._next: dict[tuple[str, str | None], int] = {}
+        self._first_step = first_step
 
     def stamp(self, output: Output) -> Output:
         """The output with its sequence number."""
         key = (output.topic.name, output.part)
         seq = self._next.get(key, 0)
+        if self._first_step is not None:
+            seq = 0 if output.topic.latched else output.message.step - self._first_step
         self._next[key] = seq + 1
         return dataclasses.replace(output, message=dataclasses.replace(output.message, seq=seq))
 

@@ -14,13 +14,15 @@ from shared.topics import Topic
 class Service:
     """A declaration. The core runs once per step of `trigger`, when all `inputs` of that step (and the latched ones of
     the episode) are there. A source (the simulator, a camera) begins episodes by itself; `closed_by` is the topic that
-    must have answered an episode that is done before the next one begins."""
+    must have answered an episode that is done before the next one begins. The core of a `divisible` one answers for
+    each object by itself, from the step's inputs alone: replicas may share the objects (`DivisibleCore`)."""
 
     name: str
     inputs: tuple[Topic, ...]
     trigger: Topic
     outputs: tuple[Topic, ...]
     closed_by: Topic | None = None
+    divisible: bool = False
 
 
 @dataclass(frozen=True)
@@ -43,6 +45,13 @@ class Core(Protocol):
 
     def step(self, inputs: Inputs) -> Iterable[Output]:
         """All inputs of one step."""
+
+
+class DivisibleCore(Core, Protocol):
+    """A core that answers for some of the objects."""
+
+    def share(self, names: tuple[str, ...]) -> None:
+        """From now on for these, maybe none."""
 
 
 class TimedSource(Core, Protocol):

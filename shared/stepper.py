@@ -6,7 +6,7 @@ The bus loop and the in-process runner both drive cores through `Stepper`, so th
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -48,7 +48,9 @@ class Stepper:
         self._last_step = -1  # of the current episode
         self._slots: dict[tuple[str, int, int], Slot] = {}
         self._latched: dict[Episode, dict[str, dict[str | None, list[Message]]]] = {}
-        self._stamper = Stamper()
+        self._stamper = self._new_stamper()
+        self._inputs_taken: dict[str, Any] | None = None  # of the last step, of a divisible service
+        self.is_due: Callable[[tuple[str, int, int]], bool] = lambda at: True  # whether a step is still to be answered
         self._topics = {topic.name: topic for topic in service.inputs}
 
     def offer(self, topic: Topic, part: str | None, message: Message) -> None:
@@ -99,7 +101,12 @@ class Stepper:
             first = [] if self._begun == (run, episode) else self._emit(self._start((run, episode)))
             self._last_step, self.at = step, at
             self._forget(at)
-            return first + self._emit(self.core.step(inputs))
+            self._inputs_taken = inputs if self.service.divisible else None
+            return first + (self._emit(self.core.step(inputs)) if self.is_due(at) else [])
+
+    def again(self) -> list[Output]:
+        """The outputs of the last step once more, from a core that answers for other objects now."""
+        return [] if self._inputs_taken is None else self._emit(self.core.step(self._inputs_taken))
 
     @property
     def wants(self) -> tuple[str, int, int] | None:
@@ -183,9 +190,12 @@ class Stepper:
         if self._begun is not None and self._begun[0] != episode[0]:
             self._past_runs.add(self._begun[0])
         self._begun, self._last_step, self.at = episode, -1, (*episode, 0)
-        self.episode_done, self._stamper = False, Stamper()
+        self.episode_done, self._stamper, self._inputs_taken = False, self._new_stamper(), None
         self._latched = {e: v for e, v in self._latched.items() if e[0] != episode[0] or e[1] >= episode[1]}
         return self.core.begin(*episode)
+
+    def _new_stamper(self) -> Stamper:
+        return Stamper(self._first_step if self.service.divisible and not self._live else None)
 
     def _forget(self, at: tuple[str, int, int]) -> None:
         """Drops the step and those before it: of one key all came in order, so what these lack is lost."""

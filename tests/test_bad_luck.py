@@ -14,7 +14,7 @@ from services.simulator.scenes import Placed, generate_split
 from services.simulator.world import World
 from shared.config import REPOSITORY, Config
 from shared.geometry import look_at
-from shared.loop import run_local
+from shared.local import run_local
 from shared.task import START_RANGE_M, start_pose
 from shared.weights import Weights
 

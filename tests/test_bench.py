@@ -22,7 +22,7 @@ from services.simulator.scenes import PAPER_SCENES, load_scenes
 from shared import provenance
 from shared.config import Config
 from shared.errors import SaccadeError
-from shared.loop import run_local
+from shared.local import run_local
 from shared.topics import ACTION, RESULT
 from tests.fakes.weights import write_random_weights
 

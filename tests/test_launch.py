@@ -17,7 +17,7 @@ from deploy.logs.check import missing
 from shared.bus import ZenohBus, free_endpoint
 from shared.config import load
 from shared.errors import SaccadeError
-from shared.loop import run_local
+from shared.local import run_local
 from shared.messages import Status
 from shared.reading import RunReader
 from shared.topics import FRAME, RESULT, STATUS

@@ -15,7 +15,8 @@ from deploy.launch import ROUTER, launch
 from deploy.logs.check import missing
 from deploy.supervisor import Process
 from shared.bus import LocalBus
-from shared.loop import run_local, serve
+from shared.local import run_local
+from shared.loop import serve
 from shared.messages import Status
 from shared.outbox import Outbox
 from shared.process import Inbox

@@ -15,7 +15,8 @@ import pytest
 from shared.bus import LocalBus, ZenohBus, free_endpoint
 from shared.config import Config
 from shared.errors import SaccadeError
-from shared.loop import main, run_local, serve
+from shared.local import run_local
+from shared.loop import main, serve
 from shared.messages import Status
 from shared.process import Inbox
 from shared.service import Output, Service

@@ -18,7 +18,7 @@ from deploy.launch import PROCESSES, launch
 from deploy.logs.check import missing
 from deploy.registry import local_pairs
 from shared.config import Config
-from shared.loop import run_local
+from shared.local import run_local
 from shared.reading import RunReader
 from shared.topics import FRAME, STATUS
 from shared.wire import stamp_of

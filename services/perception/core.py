@@ -20,7 +20,8 @@ from shared.service import Inputs, Output, Service
 from shared.topics import FRAME, GOAL, GOAL_PERCEPT, PERCEPT
 from shared.weights import Weights
 
-SERVICE = Service("perception", inputs=(FRAME, GOAL), trigger=FRAME, outputs=(PERCEPT, GOAL_PERCEPT))
+SERVICE = Service("perception", inputs=(FRAME, GOAL), trigger=FRAME, outputs=(PERCEPT, GOAL_PERCEPT),
+                  divisible=True)
 
 
 class SceneCCN:
@@ -71,19 +72,26 @@ class Perception:
     """Frames in, percepts out; the goal image once per episode by the same networks."""
 
     def __init__(self, config: Config, names: tuple[str, ...]):
-        self.names = names
-        self.model = model_of(Weights(config.weights), names, config.perception.passes)
+        self._weights, self._passes = Weights(config.weights), config.perception.passes
+        self.share(names)
+
+    def share(self, names: tuple[str, ...]) -> None:
+        """Answers for these objects from now on."""
+        self.names, self.goal_told = names, False
+        self.model = model_of(self._weights, names, self._passes) if names else None
 
     def begin(self, run: str, episode: int) -> Iterable[Output]:
         """Nothing is kept from frame to frame."""
-        self.goal_seen = False
+        self.goal_told = False
         return ()
 
     def step(self, inputs: Inputs) -> Iterable[Output]:
         """The goal's percepts at the first step of an episode, then the frame's."""
+        if self.model is None:
+            return
         frame: Frame = inputs["frame"]
-        if not self.goal_seen:
-            self.goal_seen = True
+        if not self.goal_told:
+            self.goal_told = True
             yield from self._goal(inputs["goal"])
         up = frame.world_from_camera[2, :3]
         seen = self.model.see(frame.rgb, frame.intrinsics_px, up)
