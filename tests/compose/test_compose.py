@@ -1,0 +1,139 @@
+"""`docker compose up` on a real engine, as a newcomer calls it."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+
+import pytest
+
+from shared.reading import RunReader
+from shared.topics import PERCEPT, RESULT
+from tests.compose.conftest import USER
+
+SERVICES = ("router", "simulator", "perception", "belief", "planner", "evaluator", "recorder")
+
+
+def results(path) -> list:
+    return [message for topic, _, message in RunReader(path) if topic == RESULT]
+
+
+def test_up_runs_an_episode_prints_its_result_and_leaves_the_log_to_the_user(compose):
+    (compose.folder / "runs").mkdir()
+    os.chown(compose.folder / "runs", USER, USER)
+    said = compose.up()
+    assert "reached the goal in" in said
+    assert f"log: runs/{compose.run.name}/run.mcap" in said
+    assert compose.log().complete, list(compose.log().lines())
+    assert (compose.run / "run.mcap").stat().st_uid == USER
+    for service in SERVICES:
+        told = compose.inspect(service)
+        assert told["State"]["ExitCode"] == 0, service
+        assert told["Config"]["User"] == f"{USER}:{USER}"
+        assert told["HostConfig"]["ReadonlyRootfs"]
+        assert told["HostConfig"]["CapDrop"] == ["ALL"]
+        assert "no-new-privileges:true" in told["HostConfig"]["SecurityOpt"]
+        assert told["HostConfig"]["Memory"] > 0
+        assert any(probe["ExitCode"] == 0 for probe in told["State"]["Health"]["Log"])
+        assert told["HostConfig"]["LogConfig"]["Config"]["max-size"]
+
+
+def test_a_folder_that_docker_makes_is_given_to_the_services(compose):
+    compose.up()
+    assert (compose.run / "run.mcap").stat().st_uid == USER
+    assert compose.log().complete
+
+
+@pytest.mark.parametrize("service", ["perception", "simulator", "recorder", "router"])
+def test_a_killed_container_is_started_again_and_the_run_ends_as_it_would_have(compose, service):
+    compose("up", "--detach", SACCADE_COUNT="3")
+    compose.until_said("episode 0 step 0")
+    compose.kill(service)
+    compose.until_said("log: runs/")
+    compose("wait", "recorder")
+    assert compose.inspect(service)["RestartCount"] == 1
+    assert compose.log().complete, list(compose.log().lines())
+    assert [result.success for result in results(compose.run / "run.mcap")] == [True] * 3
+
+
+def test_three_replicas_share_the_objects(compose):
+    compose.up("--scale", "perception=3")
+    assert compose.log().complete, list(compose.log().lines())
+    steps = {part: [m.step for topic, p, m in RunReader(compose.run / "run.mcap") if (topic, p) == (PERCEPT, part)]
+             for part in ("soup_can", "cereal_box")}
+    assert steps["soup_can"] == steps["cereal_box"] == list(range(len(steps["soup_can"])))
+    assert {compose.inspect("perception", number)["State"]["ExitCode"] for number in (1, 2, 3)} == {0}
+
+
+def test_a_replica_that_dies_is_replaced_by_the_others(compose):
+    compose("up", "--detach", "--scale", "perception=3", SACCADE_COUNT="3")
+    compose.until_said("episode 0 step 0")
+    compose.kill("perception", 2)
+    compose.until_said("log: runs/")
+    compose("wait", "recorder")
+    assert compose.log().complete, list(compose.log().lines())
+    assert len(results(compose.run / "run.mcap")) == 3
+
+
+def test_worlds_run_at_once(compose):
+    said = compose.up(SACCADE_WORLDS="2")
+    for world in ("table-0", "table-1"):
+        assert f"{world}: log: runs/{compose.run.name}/{world}/run.mcap" in said
+        assert compose.log(world).complete, list(compose.log(world).lines())
+    first, second = (results(compose.run / world / "run.mcap")[0].scene for world in ("table-0", "table-1"))
+    assert first != second
+
+
+def test_a_stopped_run_has_closed_its_log(compose):
+    compose("up", "--detach", SACCADE_COUNT="20")
+    compose.until_said("episode 1 step 0")
+    compose("stop")
+    assert compose.log().cut is None
+    codes = {service: compose.inspect(service)["State"]["ExitCode"] for service in SERVICES}
+    assert set(codes.values()) == {0}, codes  # 137: it was killed because it took more than 10 s
+
+
+def test_missing_scans_are_told_by_the_simulator_alone(compose):
+    compose("up", "--detach", SACCADE_OBJECTS="ycb")
+    said = compose.until_said("set SACCADE_YCB to a folder")
+    assert said.count("saccade: ") == 1
+    assert {s for s in SERVICES if compose.inspect(s)["State"]["Status"] == "running"} == set(SERVICES)
+
+
+def test_a_folder_of_someone_else_is_told_by_the_director(compose):
+    (compose.folder / "runs").mkdir()
+    os.chown(compose.folder / "runs", USER + 1, USER + 1)
+    said = compose("up", "--detach", check=False) + compose("logs", "--no-color")
+    assert f"/runs cannot be written by user {USER} (Permission denied)" in said
+
+
+def test_a_taken_port_is_told(compose):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = str(taken.getsockname()[1])
+        said = compose("up", "--detach", check=False, SACCADE_PORT=port)
+    assert port in said
+    assert "in use" in said or "already allocated" in said
+
+
+def test_each_image_has_its_own_services_dependencies_alone(built):
+    def has(service: str, package: str) -> bool:
+        return subprocess.run(["docker", "run", "--rm", "--entrypoint", "python", f"saccade/{service}", "-c",
+                               f"import {package}"], capture_output=True).returncode == 0
+
+    assert {(s, p) for s in SERVICES for p in ("torch", "mujoco", "filterpy") if has(s, p)} == {
+        ("perception", "torch"), ("simulator", "mujoco"), ("belief", "filterpy")}
+
+
+def test_a_changed_line_rebuilds_no_dependencies(built):
+    core = built.folder / "services" / "belief" / "core.py"
+    core.write_text(core.read_text() + "\n# changed\n")
+    said = subprocess.run(["docker", "build", "--file", "deploy/Dockerfile", "--target", "belief", "."],
+                          cwd=built.folder, env={**os.environ, "DOCKER_BUILDKIT": "0"}, text=True, check=True,
+                          stdout=subprocess.PIPE, stderr=subprocess.STDOUT).stdout
+    steps = said.split("Step ")
+    installed = [step for step in steps if "pip install" in step.splitlines()[0]]
+    assert installed
+    assert all("Using cache" in step for step in installed)
