@@ -17,13 +17,15 @@ from pathlib import Path
 
 from deploy.supervisor import CONFIG_NAME, HUNG_KILLED_S, KEEP_PAGES, STOP_S
 from deploy.threads import VARIABLES
+from shared.bus import WAIT_VARIABLE
 from shared.errors import SaccadeError
 from shared.process import EXIT_ERROR, HEARTBEAT_VARIABLE, LAUNCHER_VARIABLE
 
-RUNS_VARIABLE, HEARTBEATS_VARIABLE = "SACCADE_RUNS", "SACCADE_HEARTBEATS"
+RUNS_VARIABLE, HEARTBEATS_VARIABLE, WORLD_VARIABLE = "SACCADE_RUNS", "SACCADE_HEARTBEATS", "SACCADE_WORLD"
 LATEST, OVER = "latest", "over"  # in the folder of the runs, and in the one of a run
 ONE_FOR_ALL = ("router",)  # worlds share it
 POLL_S = 0.2
+ROUTER_S = "60"  # containers start in any order
 EXIT_AGAIN = 1
 
 
@@ -40,24 +42,33 @@ def heartbeat_file(name: str) -> Path:
 
 
 def worlds_of(run: Path) -> list[Path]:
-    """The folders of a run's worlds: its own, or those in it. Raises SaccadeError where it has none."""
-    if (run / CONFIG_NAME).is_file():
-        return [run.resolve()]
-    if found := sorted(path.parent.resolve() for path in run.glob(f"*/{CONFIG_NAME}")):
-        return found
-    raise SaccadeError(f"{run} holds no configuration: the director makes it; is the same folder mounted here?")
+    """The folders of the worlds of a run that goes on: its own, or those in it; none where it is over."""
+    own = [run] if (run / CONFIG_NAME).is_file() else sorted(path.parent for path in run.glob(f"*/{CONFIG_NAME}"))
+    return [] if all((world / OVER).exists() for world in own) else [world.resolve() for world in own]
+
+
+def mine(name: str, worlds: list[Path]) -> list[Path]:
+    """Those that this container serves. Raises SaccadeError where it is told to serve one that is not there."""
+    if name in ONE_FOR_ALL:
+        return worlds[:1]
+    number = os.environ.get(WORLD_VARIABLE)
+    if number is None:
+        return worlds
+    if not number.isdigit() or int(number) >= len(worlds):
+        raise SaccadeError(f"{WORLD_VARIABLE}={number}, but the run has {len(worlds)} worlds, counted from 0")
+    return [worlds[int(number)]]
 
 
 class Container:
     """The processes of one service."""
 
-    def __init__(self, name: str, worlds: Sequence[Path]) -> None:
-        self._name, self._worlds = name, worlds
-        self._stopping = threading.Event()
-        self._children = {world: self._start(world) for world in (worlds[:1] if name in ONE_FOR_ALL else worlds)}
+    def __init__(self, name: str) -> None:
+        self._name, self._stopping = name, threading.Event()
+        self._children: dict[Path, subprocess.Popen] = {}
 
     def _start(self, world: Path) -> subprocess.Popen:
-        environment = {**dict.fromkeys(VARIABLES, "1"), **KEEP_PAGES, **os.environ, LAUNCHER_VARIABLE: str(os.getpid()),
+        environment = {**dict.fromkeys(VARIABLES, "1"), **KEEP_PAGES, WAIT_VARIABLE: ROUTER_S, **os.environ,
+                       LAUNCHER_VARIABLE: str(os.getpid()),
                        HEARTBEAT_VARIABLE: str(heartbeat_file(world.name))}
         return subprocess.Popen([sys.executable, "-m", f"services.{self._name}", "--config", world / CONFIG_NAME],
                                 env=environment, start_new_session=True)
@@ -67,8 +78,15 @@ class Container:
         self._stopping.set()
 
     def run(self) -> int:
-        """Until the run is over or `stop` was called; the exit code."""
-        while not self._stopping.wait(POLL_S) and not all((world / OVER).exists() for world in self._worlds):
+        """Until the run is over or `stop` was called; the exit code. Raises SaccadeError, see `mine`."""
+        latest = runs_folder() / LATEST
+        if not worlds_of(latest):
+            print(f"saccade: {self._name} waits for a run in {runs_folder()}", file=sys.stderr, flush=True)
+        while not (worlds := worlds_of(latest)):
+            if self._stopping.wait(POLL_S):
+                return 0
+        self._children = {world: self._start(world) for world in mine(self._name, worlds)}
+        while not self._stopping.wait(POLL_S) and not all((world / OVER).exists() for world in worlds):
             if self._died() or self._hung():
                 self._end()
                 return EXIT_AGAIN
@@ -106,16 +124,16 @@ class Container:
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Exit code 2, with one line, where there is no run."""
+    """Exit code 2, with one line, where it cannot."""
     name, = sys.argv[1:] if argv is None else argv
+    container = Container(name)
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, container.stop)
     try:
-        container = Container(name, worlds_of(runs_folder() / LATEST))
+        sys.exit(container.run())
     except SaccadeError as error:
         print(f"saccade: {name}: {error}", file=sys.stderr)
         sys.exit(EXIT_ERROR)
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, container.stop)
-    sys.exit(container.run())
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import queue
 import re
 import socket
@@ -23,6 +24,8 @@ Deliver = Callable[[Topic, str | None, bytes], None]  # runs on the bus's thread
 Answer = Callable[[Iterable[Topic], Since | None, int], list[Kept]]
 Met = Callable[[frozenset[str]], None]
 
+CONFIG_VARIABLE = "ZENOH_CONFIG"  # a file of Zenoh's settings to begin with: certificates, passwords, access
+WAIT_VARIABLE, ROUTER_S = "SACCADE_ROUTER_S", 10.0
 RECALL_S = 3.0  # for an answer to be whole: a publisher that hangs must not hang who asks it
 
 
@@ -107,11 +110,12 @@ class LocalBus:
 class ZenohBus:
     """One Zenoh session in one world: the router's own (`listen`), or a client of the router at `endpoint`.
 
-    Raises SaccadeError if the endpoint is in use (listen), malformed, or does not answer within `timeout_s` seconds.
+    Raises SaccadeError if the endpoint is in use (listen), malformed, or does not answer within `timeout_s` seconds,
+    which are 10 unless SACCADE_ROUTER_S says otherwise.
     A router that goes away later is found again when it comes back.
     """
 
-    def __init__(self, endpoint: str, *, world: str, listen: bool = False, timeout_s: float = 10.0) -> None:
+    def __init__(self, endpoint: str, *, world: str, listen: bool = False, timeout_s: float | None = None) -> None:
         import zenoh  # here, so that in-process runs do without it
 
         self._world = world
@@ -126,7 +130,7 @@ class ZenohBus:
         self.endpoint = endpoint
         if not listen and endpoint.endswith(":0"):
             raise SaccadeError(f"bus at {endpoint}: port 0 is for the launcher only; name the port of a running bus")
-        self._session = _open(zenoh, endpoint, listen, timeout_s)
+        self._session = _open(zenoh, endpoint, listen, timeout_s or float(os.environ.get(WAIT_VARIABLE, ROUTER_S)))
 
     def publish(self, topic: Topic, part: str | None, payload: bytes) -> None:
         """Blocks while the network is congested: in lockstep a lost message would stop the world."""
@@ -236,7 +240,12 @@ def free_endpoint(endpoint: str) -> str:
 
 
 def _open(zenoh, endpoint: str, listen: bool, timeout_s: float):
-    config = zenoh.Config()
+    file = os.environ.get(CONFIG_VARIABLE)
+    try:
+        config = zenoh.Config.from_file(file) if file else zenoh.Config()
+    except zenoh.ZError as error:
+        raise SaccadeError(f"{CONFIG_VARIABLE}={file}: no configuration of Zenoh's: {str(error).split(' at /')[0]}"
+                           ) from error
     settings = {
         "mode": "router" if listen else "client",
         "scouting/multicast/enabled": False,
@@ -265,4 +274,17 @@ def _explain(endpoint: str, listen: bool, timeout_s: float, error: str) -> str:
     reason = error.split(" at /")[0]
     if listen:
         return f"bus at {endpoint}: cannot listen there: {reason}"
+    if _is_open(endpoint):
+        return (f"bus at {endpoint} is there, but does not let this one in: are the password, the certificates and the "
+                f"protocol right ({CONFIG_VARIABLE}={os.environ.get(CONFIG_VARIABLE, 'not set')})?")
     return f"bus at {endpoint} does not answer within {timeout_s:g} s; is it running? ({reason})"
+
+
+def _is_open(endpoint: str) -> bool:
+    """Whether something listens there."""
+    match = re.fullmatch(r"\w+/(\[[0-9a-fA-F:]+\]|[^\[\]:]+):(\d+)", endpoint)
+    if match is None:
+        return False
+    with contextlib.suppress(OSError, ValueError), socket.create_connection((match[1].strip("[]"), int(match[2])), 1.0):
+        return True
+    return False

@@ -55,9 +55,9 @@ class Compose:
         return json.loads(told)[0]
 
     def kill(self, service: str, number: int = 1) -> None:
-        """As the kernel does, not as a user: Docker starts it again."""
-        subprocess.run(["docker", "exec", "--user", "0", "--privileged", f"{self.project}-{service}-{number}", "sh",
-                        "-c", "kill -9 $(ls /proc | grep -E '^[0-9]+$' | grep -vx $$)"], capture_output=True)
+        """All its processes but the first, whose end ends that one too. (A container that a user kills stays down.)"""
+        subprocess.run(["docker", "exec", f"{self.project}-{service}-{number}", "sh", "-c",
+                        "kill -9 $(ls /proc | grep -E '^[0-9]+$' | grep -vxE \"1|$$\")"], capture_output=True)
 
     @property
     def run(self) -> Path:

@@ -1,0 +1,1 @@
+"""A bus over several hosts: certificates, passwords and who may say what."""

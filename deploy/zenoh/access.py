@@ -1,0 +1,71 @@
+"""Who may say and hear what on the bus, as Zenoh's access control has it: derived from the services' declarations."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+from deploy.registry import AGENTS, WORLDS, service_of
+from shared.service import Service
+from shared.topics import BELIEF, PLAN, RESULT, ROOT, STATUS, TRUTH, Topic
+
+SAID = ["put", "reply"]  # by whoever publishes a topic
+ASKED = ["query"]  # by whoever reads it
+SUBSCRIBED, ANSWERABLE = ["declare_subscriber"], ["declare_queryable"]
+ANY = [f"{ROOT}/**"]
+MET = ["liveliness_token", "liveliness_query", "declare_liveliness_subscriber"]
+READERS: dict[str, tuple[Topic, ...] | None] = {  # beside the services that declare what they read; None: everything
+    "recorder": None,
+    "director": (TRUTH, PLAN, BELIEF, STATUS, RESULT),
+}
+
+
+def declared() -> dict[str, Service]:
+    """The services of all agents and worlds that are processes of their own."""
+    names = {name for agent in AGENTS.values() for name in agent.services}
+    names |= {name for world in WORLDS.values() for name in (world.source, *world.judges)}
+    return {name: service_of(name) for name in sorted(names)}
+
+
+def users() -> list[str]:
+    """Everyone who is on the bus, by the name under which the router knows it."""
+    return sorted({*declared(), *READERS})
+
+
+def access_control() -> dict[str, Any]:
+    """The section `access_control` of the router's configuration: what is not declared is denied."""
+    rules, policies = [], []
+    for user in users():
+        of_user = list(_rules(user))
+        rules += of_user
+        policies.append({"rules": [rule["id"] for rule in of_user], "subjects": [user]})
+    return {"enabled": True, "default_permission": "deny", "rules": rules, "policies": policies,
+            "subjects": [{"id": user, "usernames": [user]} for user in users()]}
+
+
+def _rules(user: str) -> Iterable[dict[str, Any]]:
+    service = declared().get(user)
+    says = [f"{ROOT}/*/{STATUS.name}/{user}", *(_key(topic) for topic in (service.outputs if service else ()))]
+    hears = [_key(topic) for topic in (_inputs(service) if service else READERS[user] or ())] or ANY
+
+    def rule(what: str, messages: list[str], flow: str, keys: list[str]) -> dict[str, Any]:
+        return {"id": f"{user} {what}", "messages": messages, "flows": [flow], "permission": "allow", "key_exprs": keys}
+
+    yield rule("says", SAID + ANSWERABLE, "ingress", says)
+    yield rule("is asked", ASKED, "egress", says)
+    yield rule("asks", ASKED + SUBSCRIBED, "ingress", hears)
+    yield rule("is told", SAID, "egress", hears)
+    # that someone listens, maybe to more than this one says, or could answer: without it nothing is sent
+    yield rule("knows who is there", SUBSCRIBED + ANSWERABLE, "egress", ANY)
+    members = [f"{ROOT}/*/@members/{user}/*"]
+    yield rule("meets", MET, "ingress", members)
+    yield rule("is met", MET, "egress", members)
+
+
+def _inputs(service: Service) -> tuple[Topic, ...]:
+    closed = (service.closed_by,) if service.closed_by else ()
+    return (*service.inputs, *closed, STATUS, *(service.outputs if service.divisible else ()))
+
+
+def _key(topic: Topic) -> str:
+    return topic.key("*")

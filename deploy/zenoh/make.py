@@ -1,0 +1,95 @@
+"""`python -m deploy.zenoh.make FOLDER --host NAME`: all that a bus over several hosts needs, in a new folder.
+
+For the router `router.json5`, its certificate and the passwords; for each service `<service>.json5`, its certificate
+and key; an authority of their own. Copy to each host what is its own, and set ZENOH_CONFIG to the .json5.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import secrets
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from deploy.zenoh.access import access_control, users
+from shared.errors import SaccadeError
+
+DAYS = 825
+AUTHORITY, ROUTER = "authority", "router"
+
+
+def make(folder: Path, hosts: Sequence[str], where: Path | None = None) -> None:
+    """Writes everything; in the configurations the files are in `where` (the folder, unless given). Raises SaccadeError
+    where the folder is there already, and where openssl is not."""
+    where = where or folder.resolve()
+    try:
+        folder.mkdir(parents=True)
+    except OSError as error:
+        raise SaccadeError(f"{folder} cannot be made ({error.strerror}): name a new folder") from error
+    folder.chmod(0o700)
+    _openssl("req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes", "-days", str(DAYS),
+             "-subj", "/CN=saccade", "-keyout", folder / f"{AUTHORITY}.key", "-out", folder / f"{AUTHORITY}.pem")
+    passwords = {user: secrets.token_urlsafe(24) for user in users()}
+    (folder / "users.txt").write_text("".join(f"{user}:{password}\n" for user, password in passwords.items()))
+    names = [f"IP:{host}" if host.replace(".", "").isdigit() or ":" in host else f"DNS:{host}" for host in hosts]
+    _certify(folder, ROUTER, ",".join(names))
+    tls = {"root_ca_certificate": str(where / f"{AUTHORITY}.pem"), "enable_mtls": True}
+    _write(folder / f"{ROUTER}.json5", {
+        "transport": {"link": {"tls": {**tls, **_pair(where, ROUTER, "listen")}},
+                      "auth": {"usrpwd": {"dictionary_file": str(where / "users.txt")}}},
+        "access_control": access_control()})
+    for user, password in passwords.items():
+        _certify(folder, user, f"DNS:{user}")
+        _write(folder / f"{user}.json5", {
+            "transport": {"link": {"tls": {**tls, **_pair(where, user, "connect")}},
+                          "auth": {"usrpwd": {"user": user, "password": password}}}})
+
+
+def _pair(where: Path, name: str, role: str) -> dict[str, str]:
+    return {f"{role}_certificate": str(where / f"{name}.pem"), f"{role}_private_key": str(where / f"{name}.key")}
+
+
+def _write(path: Path, tree: dict) -> None:
+    path.write_text(json.dumps(tree, indent=1) + "\n")
+
+
+def _certify(folder: Path, name: str, alternative: str) -> None:
+    request = folder / f"{name}.csr"
+    _openssl("req", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes", "-subj", f"/CN={name}",
+             "-keyout", folder / f"{name}.key", "-out", request)
+    extensions = folder / f"{name}.ext"
+    extensions.write_text(f"subjectAltName={alternative}\nextendedKeyUsage=serverAuth,clientAuth\n")
+    _openssl("x509", "-req", "-in", request, "-CA", folder / f"{AUTHORITY}.pem", "-CAkey", folder / f"{AUTHORITY}.key",
+             "-CAcreateserial", "-days", str(DAYS), "-extfile", extensions, "-out", folder / f"{name}.pem")
+    request.unlink()
+    extensions.unlink()
+
+
+def _openssl(*arguments: str | Path) -> None:
+    try:
+        subprocess.run(["openssl", *map(str, arguments)], check=True, capture_output=True, text=True)
+    except OSError as error:
+        raise SaccadeError("openssl is needed to make certificates: install it") from error
+    except subprocess.CalledProcessError as error:
+        raise SaccadeError(f"openssl {arguments[0]} failed: {error.stderr.strip().splitlines()[-1]}") from error
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Exit code 2, with one line, where it cannot."""
+    parser = argparse.ArgumentParser(prog="python -m deploy.zenoh.make", description=__doc__.splitlines()[0])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--host", action="append", required=True, help="name or address of the router; may be repeated")
+    parser.add_argument("--where", type=Path, help="the folder in which they will be, if another")
+    told = parser.parse_args(argv)
+    try:
+        make(told.folder, told.host, told.where)
+    except SaccadeError as error:
+        print(f"saccade: {error}", file=sys.stderr)
+        sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,177 @@
+"""A bus between two hosts, here two network namespaces: mutual TLS, passwords, and who may say and hear what."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO
+
+import pytest
+
+from deploy.logs.check import missing
+from deploy.zenoh.access import access_control, declared, users
+from deploy.zenoh.make import make
+from shared.config import REPOSITORY
+
+ADDRESS, OTHER = "10.199.7.1", "10.199.7.2"
+ENDPOINT = f"tls/{ADDRESS}:7447"
+SAY = """
+import sys, time
+from shared.bus import ZenohBus
+from shared.topics import TOPICS
+bus = ZenohBus(sys.argv[1], world="table", timeout_s=3)
+time.sleep(0.5)
+bus.publish(TOPICS[sys.argv[2]], None, sys.argv[3].encode())
+time.sleep(0.5)
+bus.close()
+"""
+HEAR = """
+import sys, time
+from shared.bus import ZenohBus
+from shared.topics import TOPICS
+bus = ZenohBus(sys.argv[1], world="table", timeout_s=3)
+bus.subscribe([TOPICS[sys.argv[2]]], lambda topic, part, payload: print("heard", payload.decode(), flush=True))
+print("listens", flush=True)
+time.sleep(60)
+"""
+ROUTER = """
+import sys, time
+from shared.bus import ZenohBus
+bus = ZenohBus(sys.argv[1], world="table", listen=True)
+print("listens", flush=True)
+time.sleep(300)
+"""
+
+
+def ip(*arguments: str, check: bool = True) -> bool:
+    return subprocess.run(["ip", *arguments], check=check, capture_output=True).returncode == 0
+
+
+class Hosts:
+    """Two of them with a cable, and the files of `deploy.zenoh.make`."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.names = folder, (f"saccade-a-{os.getpid()}", f"saccade-b-{os.getpid()}")
+        self.processes: list[subprocess.Popen] = []
+
+    def start(self, host: int, user: str | Path | None, *command: str, out: int | IO = subprocess.PIPE,
+              **environment: str) -> subprocess.Popen:
+        """A process on host 0 or 1 as that user: a name, another configuration, or nobody."""
+        file = self.folder / f"{user}.json5" if isinstance(user, str) else user
+        environment = {**os.environ, "PYTHONPATH": str(REPOSITORY), **environment}
+        if file:
+            environment["ZENOH_CONFIG"] = str(file)
+        process = subprocess.Popen(["ip", "netns", "exec", self.names[host], sys.executable, *command], text=True,
+                                   env=environment, stdout=out, stderr=subprocess.STDOUT)
+        self.processes.append(process)
+        return process
+
+    def hear(self, host: int, user: str, topic: str) -> subprocess.Popen:
+        listener = self.start(host, user, "-c", HEAR, ENDPOINT, topic)
+        assert "listens" in listener.stdout.readline()
+        return listener
+
+    def say(self, host: int, user: str | Path | None, topic: str, text: str) -> str:
+        return self.start(host, user, "-c", SAY, ENDPOINT, topic, text).communicate(timeout=30)[0]
+
+
+@pytest.fixture
+def hosts(tmp_path) -> Iterator[Hosts]:
+    hosts = Hosts(tmp_path / "bus")
+    a, b = hosts.names
+    if os.geteuid() != 0 or not ip("netns", "add", a, check=False):
+        pytest.skip("network namespaces need root: the two hosts are not tested here")
+    with contextlib.ExitStack() as stack:
+        stack.callback(ip, "netns", "del", a)
+        ip("netns", "add", b)
+        stack.callback(ip, "netns", "del", b)
+        ip("link", "add", "cable", "netns", a, "type", "veth", "peer", "name", "cable", "netns", b)
+        for name, address in ((a, ADDRESS), (b, OTHER)):
+            ip("-n", name, "address", "add", f"{address}/24", "dev", "cable")
+            ip("-n", name, "link", "set", "cable", "up")
+            ip("-n", name, "link", "set", "lo", "up")
+        make(hosts.folder, [ADDRESS])
+        yield hosts
+        for process in hosts.processes:
+            process.kill()
+            process.wait()
+
+
+def heard(listener: subprocess.Popen) -> list[str]:
+    listener.kill()
+    return listener.communicate()[0].split()[1::2]
+
+
+def test_only_who_is_known_gets_in_and_says_only_what_it_may(hosts, tmp_path):
+    assert "listens" in hosts.start(0, "router", "-c", ROUTER, ENDPOINT).stdout.readline()
+    simulator, evaluator = hosts.hear(0, "simulator", "action"), hosts.hear(1, "evaluator", "truth")
+    curious = hosts.hear(1, "planner", "truth")
+    refused = hosts.say(1, None, "action", "nobody")
+    assert "does not let this one in" in refused
+    wrong = json.loads((hosts.folder / "planner.json5").read_text())
+    wrong["transport"]["auth"]["usrpwd"]["password"] = "wrong"
+    (tmp_path / "wrong.json5").write_text(json.dumps(wrong))
+    assert "does not let this one in" in hosts.say(1, tmp_path / "wrong.json5", "action", "wrong-password")
+    make(tmp_path / "others", [ADDRESS])
+    strange = json.loads((hosts.folder / "planner.json5").read_text())
+    strange["transport"]["link"] = json.loads((tmp_path / "others" / "planner.json5").read_text())["transport"]["link"]
+    strange["transport"]["link"]["tls"]["root_ca_certificate"] = str(hosts.folder / "authority.pem")
+    (tmp_path / "strange.json5").write_text(json.dumps(strange))
+    assert "does not let this one in" in hosts.say(1, tmp_path / "strange.json5", "action", "strange-certificate")
+    assert hosts.say(1, "belief", "action", "belief-is-no-planner") == ""
+    assert hosts.say(1, "planner", "action", "planner") == ""
+    assert hosts.say(0, "simulator", "truth", "simulator") == ""
+    assert hosts.say(1, "planner", "truth", "planner-is-no-simulator") == ""
+    assert heard(simulator) == ["planner"]
+    assert heard(evaluator) == ["simulator"]
+    assert heard(curious) == []
+
+
+def test_an_agent_runs_across_two_hosts(hosts, tmp_path):
+    here, there = ("router", "simulator", "evaluator", "recorder"), ("perception", "belief", "planner")
+    runs = {"SACCADE_RUNS": str(tmp_path / "runs")}
+    for host, names in enumerate((here, there)):
+        for name in names:
+            with (tmp_path / f"{name}.log").open("w") as log:
+                hosts.start(host, name, "-m", "deploy.container", name, out=log,
+                            SACCADE_HEARTBEATS=str(tmp_path / name), **runs)
+    director = hosts.start(0, "director", "-m", "deploy.director", f"--endpoint={ENDPOINT}", "--seed=3",
+                           SACCADE_HEARTBEATS=str(tmp_path / "director"), **runs)
+    said = director.communicate(timeout=240)[0]
+    assert "reached the goal in" in said, said + "".join(path.read_text() for path in tmp_path.glob("*.log"))
+    ends = {" ".join(map(str, p.args[6:])): p.wait(timeout=60) for p in hosts.processes[:-1]}
+    assert set(ends.values()) == {0}, ends
+    report = missing(tmp_path / "runs" / "latest" / "run.mcap")
+    assert report.complete, list(report.lines())
+
+
+def test_access_follows_the_declarations():
+    rules = {rule["id"]: rule["key_exprs"] for rule in access_control()["rules"]}
+    assert [user for user in users() if "saccade/*/action" in rules[f"{user} says"]] == ["planner"]
+    readers = {user for user in users() if {"saccade/*/truth", "saccade/**"} & set(rules[f"{user} asks"])}
+    assert readers == {"evaluator", "recorder", "director"}
+    assert set(declared()) == {"belief", "camera", "evaluator", "perception", "planner", "simulator"}
+
+
+def test_a_configuration_that_is_none_is_told(tmp_path):
+    (tmp_path / "z.json5").write_text("{")
+    done = subprocess.run([sys.executable, "-c", SAY, "tcp/127.0.0.1:1", "action", "x"], text=True, capture_output=True,
+                          env={**os.environ, "ZENOH_CONFIG": str(tmp_path / "z.json5"), "PYTHONPATH": str(REPOSITORY)})
+    assert f"ZENOH_CONFIG={tmp_path / 'z.json5'}: no configuration of Zenoh's" in done.stderr
+
+
+def test_the_files_are_for_their_owner_and_made_once(tmp_path):
+    make(tmp_path / "bus", ["router.example", ADDRESS])
+    assert (tmp_path / "bus").stat().st_mode & 0o077 == 0
+    passwords = dict(line.split(":") for line in (tmp_path / "bus" / "users.txt").read_text().split())
+    assert set(passwords) == set(users())
+    assert len(set(passwords.values())) == len(passwords)
+    text = subprocess.run(["openssl", "x509", "-in", tmp_path / "bus" / "router.pem", "-noout", "-ext",
+                           "subjectAltName"], capture_output=True, text=True, check=True).stdout
+    assert "DNS:router.example" in text
+    assert f"IP Address:{ADDRESS}" in text
