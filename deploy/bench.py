@@ -109,7 +109,7 @@ def facts(plan: Plan, command: str) -> dict[str, Any]:
             "scenes": {"suite": plan.suite, "file": shown(file), "sha256": digest}, "config": config}
 
 
-def bench(plan: Plan, *, jobs: int, command: str, console: Console) -> list[dict[str, Any]]:
+def bench(plan: Plan, *, jobs: int, command: str, console: Console, cluster: str | None = None) -> list[dict[str, Any]]:
     """Runs what is not there yet, writes `plan.out`, prints the table; returns the records in the file's order.
 
     Raises SaccadeError for a scene that cannot be run and for results of another run in the way; what has been reached
@@ -125,7 +125,7 @@ def bench(plan: Plan, *, jobs: int, command: str, console: Console) -> list[dict
     try:
         with plan.partial.open("a") as partial, _progress(console, len(wanted)) as show:
             show(list(done.values()))
-            for record in _records(plan, todo, jobs):
+            for record in _records(plan, todo, jobs, cluster):
                 partial.write(json.dumps(record) + "\n")
                 partial.flush()
                 done[record["scene"]] = record
@@ -186,12 +186,12 @@ def _progress(console: Console, total: int) -> Iterator:
         yield show
 
 
-def _records(plan: Plan, numbers: Sequence[int], jobs: int) -> Iterator[dict[str, Any]]:
+def _records(plan: Plan, numbers: Sequence[int], jobs: int, cluster: str | None = None) -> Iterator[dict[str, Any]]:
     """The records of these scenes as they are ready."""
     text = plan.config.model_dump_json()
     work = {plan.scenes[number].id: (plan.agent, text, number) for number in numbers}
     try:
-        for _, record in in_processes(run_scene, work, jobs):
+        for _, record in in_processes(run_scene, work, jobs, cluster):
             yield record
     except SaccadeError as error:
         raise SaccadeError(f"{error}; the results so far are in {plan.partial}") from error

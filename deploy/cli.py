@@ -103,6 +103,8 @@ def bench(*, objects: Objects = None, scenes: ScenesFile = None,
           agent: Annotated[str, typer.Option(help="which agent")] = "sceneccn",
           limit: Annotated[int | None, typer.Option(min=1, help="only so many scenes, evenly chosen")] = None,
           jobs: Annotated[int, typer.Option(min=1, help="processes at a time")] = 1,
+          cluster: Annotated[str | None, typer.Option(
+              metavar="ADDRESS", help="a Ray cluster in place of --jobs: ray://host:10001")] = None,
           json: Annotated[Path | None, typer.Option(
               help="file for the results [default: bench/<agent>_<set>[_<suite>].json]")] = None,
           yaw: Annotated[Literal["random", "fixed"] | None, typer.Option(
@@ -122,7 +124,7 @@ def bench(*, objects: Objects = None, scenes: ScenesFile = None,
         suite = {"fixed": "paper-like", "random": "paper-like-yaw"}[yaw]
     name = "_".join(filter(None, (agent, resolved.scene.objects, suite)))
     plan = prepare(agent, resolved, json or Path("bench") / f"{name}.json", suite=suite, limit=limit)
-    run_bench(plan, jobs=jobs, command=command_line(), console=wide(Console()))
+    run_bench(plan, jobs=jobs, cluster=cluster, command=command_line(), console=wide(Console()))
 
 
 @app.command()

@@ -163,8 +163,8 @@ def test_interrupted_run_is_taken_up_again_with_the_same_outcome(tmp_path, monke
     run_bench(prepare("oracle", drawn, whole, limit=5), jobs=2)
     records, asked = bench_module._records, []
 
-    def stop_after_two(plan, numbers, jobs):
-        for count, result in enumerate(records(plan, numbers, jobs)):
+    def stop_after_two(plan, numbers, *how):
+        for count, result in enumerate(records(plan, numbers, *how)):
             if count == 2:
                 raise KeyboardInterrupt
             yield result
@@ -175,7 +175,7 @@ def test_interrupted_run_is_taken_up_again_with_the_same_outcome(tmp_path, monke
     assert not plan.out.exists()
     with plan.partial.open("a") as partial:
         partial.write('{"scene": "cut')
-    monkeypatch.setattr(bench_module, "_records", lambda p, n, j: asked.extend(n) or records(p, n, j))
+    monkeypatch.setattr(bench_module, "_records", lambda p, n, *how: asked.extend(n) or records(p, n, *how))
     run_bench(plan)
     assert len(asked) == 3
     first, second = (json.loads(path.read_text()) for path in (whole, plan.out))
