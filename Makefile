@@ -1,14 +1,22 @@
-# `make run`: set up and run one episode.  `make test`: set up and run all tests.
+# `make run`: set up and run one episode.  `make up`: the same in containers.  `make test`: set up and run all tests.
 PYTHON ?= python3
 SACCADE = .venv/bin/saccade
 
-.PHONY: run test lint bench fixtures clean
+.PHONY: run up test test-compose lint bench fixtures clean
 
 run: .venv/.installed
 	$(SACCADE) run
 
 test: .venv/.installed-dev lint
 	.venv/bin/python -m pytest -q
+
+# As the user who calls it; root has the containers run as user 1000.
+up:
+	[ "$$(id -u)" = 0 ] || export SACCADE_UID=$$(id -u) SACCADE_GID=$$(id -g); \
+	SACCADE_COMMIT=$$(git rev-parse HEAD) docker compose up --build
+
+test-compose: .venv/.installed-dev
+	.venv/bin/python -m pytest -q tests/compose
 
 lint: .venv/.installed-dev
 	.venv/bin/ruff check .

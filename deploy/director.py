@@ -27,17 +27,17 @@ from deploy.container import LATEST, OVER, heartbeat_file, runs_folder
 from deploy.display import LINE_EVERY, Progress, line
 from deploy.ending import ending
 from deploy.launch import LOG_NAME, Graph, follow, messages, resolve
-from deploy.options import configured
-from deploy.registry import agent_processes
+from deploy.options import configured, numbers
+from deploy.registry import DEFAULT_WORLD, WORLDS, agent_processes, world_of
 from deploy.supervisor import CONFIG_NAME, HUNG_S, Process
 from shared.bus import ZenohBus
 from shared.config import REPOSITORY, Config, load
 from shared.errors import SaccadeError
 from shared.messages import Message, Result
 from shared.process import EXIT_ERROR
-from shared.topics import BELIEF, PLAN, RESULT, STATUS, TRUTH, Topic
+from shared.topics import BELIEF, FRAME, PLAN, RESULT, STATUS, TRUTH, Topic
 
-SHOWN = (TRUTH, PLAN, BELIEF, STATUS, RESULT)
+SHOWN = (PLAN, BELIEF, STATUS, RESULT)
 BEAT_S = 0.5
 ROUTER_S = 60.0  # containers start one after the other
 
@@ -52,13 +52,22 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=None)
     parser.add_argument("--count", type=int, default=None, help="scenes, one after the other")
     parser.add_argument("--worlds", type=int, default=1, help="scenes at once")
+    parser.add_argument("--world", default=DEFAULT_WORLD, help=f"one of {', '.join(WORLDS)}")
+    parser.add_argument("--source", help="of a camera's images: a folder or a video")
+    parser.add_argument("--poses", help="where that camera was: JSON lines or TUM")
+    parser.add_argument("--intrinsics", metavar="fx,fy,cx,cy", help="of its images, in pixels")
     parser.add_argument("--set", default="", metavar="'KEY=VALUE ...'", help="configuration by dotted keys")
     told = parser.parse_args(argv)
     signal.signal(signal.SIGTERM, lambda *_: os._exit(0))  # its threads wait for messages; nothing is unsaved
     try:
         given = {"bus.endpoint": told.endpoint, "bus.listen": told.listen, "scene.objects": told.objects,
-                 "perception.weights": weights_of(told.weights), "seed": told.seed, "scene.count": told.count}
-        direct(configured(None, given, shlex.split(told.set)), told.worlds, runs_folder(), Console(width=200))
+                 "perception.weights": weights_of(told.weights), "seed": told.seed, "scene.count": told.count,
+                 "camera.source": told.source or None, "camera.poses": told.poses or None,
+                 "camera.intrinsics_px": numbers(told.intrinsics or None)}
+        if world_of(told.world).live:  # there is nobody to draw scenes, and nobody waits
+            given |= {"scene.count": None, "scene.explore": True, "bus.live": True}
+        config = configured(None, given, shlex.split(told.set))
+        direct(config, told.world, told.worlds, runs_folder(), Console(width=200))
     except SaccadeError as error:
         print(f"saccade: {error}", file=sys.stderr)
         sys.exit(EXIT_ERROR)
@@ -71,9 +80,9 @@ def weights_of(name: str | None) -> Path | None:
     return Path(name) if "/" in name else REPOSITORY / "weights" / name
 
 
-def direct(config: Config, worlds: int, runs: Path, console: Console) -> list[Result]:
+def direct(config: Config, world: str, worlds: int, runs: Path, console: Console) -> list[Result]:
     """Prepares a run and follows it to its end: the results of all its worlds. Raises SaccadeError where it cannot."""
-    processes = agent_processes("sceneccn")
+    processes = agent_processes("sceneccn", world)
     folders = prepare(resolve(config, processes), worlds, runs)
     with _Beating():
         console.print(f"run {folders[0].parent.name if worlds > 1 else folders[0].name}: waits for its services")
@@ -111,18 +120,19 @@ def prepare(config: Config, worlds: int, runs: Path) -> list[Path]:
 def _follow(folder: Path, processes: Sequence[Process], console: Console, worlds: int) -> list[Result]:
     config = load(folder / CONFIG_NAME)
     prefix = f"{config.bus.world}: " if worlds > 1 else ""
-    progress, arrived = Progress(), queue.SimpleQueue()
+    progress, arrived = Progress(judged=not config.bus.live), queue.SimpleQueue()
+    view = FRAME if config.bus.live else TRUTH
 
     def say(text: str) -> None:
         console.print(prefix + text, markup=False, highlight=False, soft_wrap=True)
 
     def on_message(topic: Topic, part: str | None, message: Message) -> None:
         progress.take(topic, part, message)
-        if topic == TRUTH and message.step % LINE_EVERY == 0:
+        if topic == view and message.step % LINE_EVERY == 0:
             say(line(progress))
 
     with closing(ZenohBus(config.bus.endpoint, world=config.bus.world, timeout_s=ROUTER_S)) as bus:
-        bus.subscribe(SHOWN, lambda *item: arrived.put(item))
+        bus.subscribe((view, *SHOWN), lambda *item: arrived.put(item))
         elsewhere = Elsewhere([process.name for process in processes[1:]], say)  # the router is the first world's
         graph = Graph(bus, elsewhere, messages(arrived, bus, elsewhere, config.run))
         results = follow(graph, processes, on_message)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -102,6 +103,7 @@ class _Loop:
         if self._share:
             stepper.is_due = lambda at: self._share.lacks(core.names, at)
         self._next_episode, self._closed = 0, -1
+        self._refused: set[Topic] = set()
         self._end = core.episodes if self._source else 0
 
     @property
@@ -173,6 +175,9 @@ class _Loop:
             self._stepper.offer(topic, part, message)
         except MessageError as error:
             self.health.refuse(topic, part, error)
+            if topic not in self._refused:  # once, for whoever reads what the process prints
+                self._refused.add(topic)
+                print(f"saccade: {self.health.service}: {self.health.note}", file=sys.stderr, flush=True)
 
     def begin_if_due(self) -> None:
         """Begins a source's next episode, if everyone is there and the one before it is over and closed."""

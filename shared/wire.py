@@ -98,8 +98,8 @@ def decode(message_type: type[Message], payload: bytes) -> Message:
         raise MessageError(f"not msgpack ({type(error).__name__})") from error
     if not isinstance(fields, dict) or fields.pop("type", None) != message_type.__name__:
         raise MessageError(f"type: not a {message_type.__name__}")
-    if fields.pop("version", None) != message_type.VERSION:
-        raise MessageError(f"version: not {message_type.VERSION}")
+    if (version := fields.pop("version", None)) != message_type.VERSION:
+        raise MessageError(f"version: {version!r}, not {message_type.VERSION}: it comes from another release")
     _check(message_type, fields)
     return message_type(**fields)
 

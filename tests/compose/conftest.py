@@ -24,9 +24,9 @@ class Compose:
     """`docker compose` in a clone, as a project of its own."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder, self.project = folder, f"saccade-test-{os.getpid()}"
+        self.folder, self.project, self.port = folder, f"saccade-test-{os.getpid()}", free_port()
         self._environment = {name: value for name, value in os.environ.items() if not name.startswith("SACCADE_")}
-        self._environment |= {"SACCADE_UID": str(USER), "SACCADE_GID": str(USER), "SACCADE_PORT": str(free_port())}
+        self._environment |= {"SACCADE_UID": str(USER), "SACCADE_GID": str(USER), "SACCADE_PORT": str(self.port)}
 
     def __call__(self, *arguments: str, timeout_s: float = RUN_S, check: bool = True, **environment: str) -> str:
         """What it prints. With `check` its exit code is 0."""

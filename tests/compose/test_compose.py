@@ -9,9 +9,13 @@ import subprocess
 
 import pytest
 
+from shared.bus import ZenohBus
 from shared.reading import RunReader
-from shared.topics import PERCEPT, RESULT
-from tests.compose.conftest import USER
+from shared.topics import ACTION, PERCEPT, RESULT
+from shared.wire import encode
+from tests.compose.conftest import BUILD_S, USER
+from tests.fakes.camera import LENS_PX, film
+from tests.samples import sample
 
 SERVICES = ("router", "simulator", "perception", "belief", "planner", "evaluator", "recorder")
 
@@ -93,6 +97,42 @@ def test_a_stopped_run_has_closed_its_log(compose):
     assert compose.log().cut is None
     codes = {service: compose.inspect(service)["State"]["ExitCode"] for service in SERVICES}
     assert set(codes.values()) == {0}, codes  # 137: it was killed because it took more than 10 s
+
+
+def test_a_camera_stands_in_the_simulators_place(compose, tmp_path):
+    for path in (tmp_path, *tmp_path.parents[:2]):
+        path.chmod(0o755)
+    centers = film(tmp_path / "table.avi", tmp_path / "poses.jsonl", 12)
+    said = compose.up(COMPOSE_PROFILES="camera", SACCADE_SOURCE=str(tmp_path / "table.avi"),
+                      SACCADE_POSES=str(tmp_path / "poses.jsonl"), SACCADE_INTRINSICS=",".join(map(str, LENS_PX)))
+    assert all(f"found {name} at" in said for name in centers), said
+    assert compose.log().complete, list(compose.log().lines())
+
+
+def test_a_run_is_replayed_into_perception(compose):
+    compose.up()
+    said = compose("run", "--rm", "--no-TTY", "replay", timeout_s=BUILD_S)
+    assert "0 differences" in said or "as recorded" in said, said
+
+
+def test_a_second_simulator_is_refused_and_the_run_goes_on(compose):
+    said = compose.up("--scale", "simulator=2")
+    assert said.count("saccade: another simulator is in this world already") == 1
+    assert "reached the goal in" in said
+    assert compose.log().complete, list(compose.log().lines())
+
+
+def test_a_message_of_another_release_is_told_by_who_refuses_it(compose):
+    compose("up", "--detach", SACCADE_COUNT="3")
+    compose.until_said("episode 0 step 0")
+    bus = ZenohBus(f"tcp/127.0.0.1:{compose.port}", world="table")
+    action = encode(sample(ACTION.type))
+    bus.publish(ACTION, None, action.replace(b"\xa7version\x01", b"\xa7version\x02"))
+    said = compose.until_said("log: runs/")
+    bus.close()
+    assert said.count("saccade: simulator: refused: action: version: 2, not 1: it comes from another release") == 1
+    compose("wait", "recorder")
+    assert [result.success for result in results(compose.run / "run.mcap")] == [True] * 3
 
 
 def test_missing_scans_are_told_by_the_simulator_alone(compose):
