@@ -82,7 +82,7 @@ def prepare(log: Path, into: Sequence[str], values: dict, *, pace: Pace, topics:
     config, run, cut = recorded_config(log)
     live = config.bus.live
     config = config.with_values({"run": run, "bus.wait_for": [], "bus.live": False, "bus.endpoint": "tcp/127.0.0.1:0",
-                                 "bus.first_step": max(start_step, cut)} | values)
+                                 "bus.listen": None, "bus.first_step": max(start_step, cut)} | values)
     services = [service_of(name) for name in ordered]
     made = {topic.name for service in services for topic in service.outputs}
     wanted = {topic.name for service in services for topic in service.inputs} - made
