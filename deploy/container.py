@@ -1,7 +1,8 @@
 """`python -m deploy.container SERVICE`: a service where something else starts and restarts it, such as Docker.
 
-One process for each world of the newest run in SACCADE_RUNS, until that run is over. It ends with code 1 when one of
-them died or hung, so that it is started again; a service that said why it cannot run stays down until told to stop.
+One process for each world of the newest run in SACCADE_RUNS, or for world number SACCADE_WORLD alone, until that run is
+over. With SACCADE_WAIT set it waits until there is one. It ends with code 1 when one of them died or hung, so that it
+is started again; a service that said why it cannot run stays down until then.
 """
 
 from __future__ import annotations
@@ -17,11 +18,12 @@ from pathlib import Path
 
 from deploy.supervisor import CONFIG_NAME, HUNG_KILLED_S, KEEP_PAGES, STOP_S
 from deploy.threads import VARIABLES
-from shared.bus import WAIT_VARIABLE
+from shared.bus import ROUTER_WAIT_VARIABLE
 from shared.errors import SaccadeError
 from shared.process import EXIT_ERROR, HEARTBEAT_VARIABLE, LAUNCHER_VARIABLE
 
-RUNS_VARIABLE, HEARTBEATS_VARIABLE, WORLD_VARIABLE = "SACCADE_RUNS", "SACCADE_HEARTBEATS", "SACCADE_WORLD"
+RUNS_VARIABLE, HEARTBEATS_VARIABLE = "SACCADE_RUNS", "SACCADE_HEARTBEATS"
+WORLD_VARIABLE, WAIT_VARIABLE = "SACCADE_WORLD", "SACCADE_WAIT"
 LATEST, OVER = "latest", "over"  # in the folder of the runs, and in the one of a run
 ONE_FOR_ALL = ("router",)  # worlds share it
 POLL_S = 0.2
@@ -67,7 +69,7 @@ class Container:
         self._children: dict[Path, subprocess.Popen] = {}
 
     def _start(self, world: Path) -> subprocess.Popen:
-        environment = {**dict.fromkeys(VARIABLES, "1"), **KEEP_PAGES, WAIT_VARIABLE: ROUTER_S, **os.environ,
+        environment = {**dict.fromkeys(VARIABLES, "1"), **KEEP_PAGES, ROUTER_WAIT_VARIABLE: ROUTER_S, **os.environ,
                        LAUNCHER_VARIABLE: str(os.getpid()),
                        HEARTBEAT_VARIABLE: str(heartbeat_file(world.name))}
         return subprocess.Popen([sys.executable, "-m", f"services.{self._name}", "--config", world / CONFIG_NAME],
@@ -81,6 +83,9 @@ class Container:
         """Until the run is over or `stop` was called; the exit code. Raises SaccadeError, see `mine`."""
         latest = runs_folder() / LATEST
         if not worlds_of(latest):
+            if not os.environ.get(WAIT_VARIABLE):
+                print(f"saccade: {self._name}: no run goes on in {runs_folder()}", file=sys.stderr)
+                return 0
             print(f"saccade: {self._name} waits for a run in {runs_folder()}", file=sys.stderr, flush=True)
         while not (worlds := worlds_of(latest)):
             if self._stopping.wait(POLL_S):

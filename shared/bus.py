@@ -25,7 +25,7 @@ Answer = Callable[[Iterable[Topic], Since | None, int], list[Kept]]
 Met = Callable[[frozenset[str]], None]
 
 CONFIG_VARIABLE = "ZENOH_CONFIG"  # a file of Zenoh's settings to begin with: certificates, passwords, access
-WAIT_VARIABLE, ROUTER_S = "SACCADE_ROUTER_S", 10.0
+ROUTER_WAIT_VARIABLE, ROUTER_S = "SACCADE_ROUTER_S", 10.0
 RECALL_S = 3.0  # for an answer to be whole: a publisher that hangs must not hang who asks it
 
 
@@ -130,7 +130,8 @@ class ZenohBus:
         self.endpoint = endpoint
         if not listen and endpoint.endswith(":0"):
             raise SaccadeError(f"bus at {endpoint}: port 0 is for the launcher only; name the port of a running bus")
-        self._session = _open(zenoh, endpoint, listen, timeout_s or float(os.environ.get(WAIT_VARIABLE, ROUTER_S)))
+        timeout_s = timeout_s or float(os.environ.get(ROUTER_WAIT_VARIABLE, ROUTER_S))
+        self._session = _open(zenoh, endpoint, listen, timeout_s)
 
     def publish(self, topic: Topic, part: str | None, payload: bytes) -> None:
         """Blocks while the network is congested: in lockstep a lost message would stop the world."""

@@ -134,7 +134,7 @@ def test_only_who_is_known_gets_in_and_says_only_what_it_may(hosts, tmp_path):
 
 def test_an_agent_runs_across_two_hosts(hosts, tmp_path):
     here, there = ("router", "simulator", "evaluator", "recorder"), ("perception", "belief", "planner")
-    runs = {"SACCADE_RUNS": str(tmp_path / "runs")}
+    runs = {"SACCADE_RUNS": str(tmp_path / "runs"), "SACCADE_WAIT": "1"}
     for host, names in enumerate((here, there)):
         for name in names:
             with (tmp_path / f"{name}.log").open("w") as log:
