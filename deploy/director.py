@@ -27,11 +27,11 @@ from deploy.container import LATEST, OVER, heartbeat_file, runs_folder
 from deploy.display import LINE_EVERY, Progress, line
 from deploy.ending import ending
 from deploy.launch import LOG_NAME, Graph, follow, messages, resolve
-from deploy.options import configured, numbers
+from deploy.options import configured, numbers, weights_folder
 from deploy.registry import DEFAULT_WORLD, WORLDS, agent_processes, world_of
 from deploy.supervisor import CONFIG_NAME, HUNG_S, Process
 from shared.bus import ZenohBus
-from shared.config import REPOSITORY, Config, load
+from shared.config import Config, load
 from shared.errors import SaccadeError
 from shared.messages import Message, Result
 from shared.process import EXIT_ERROR
@@ -61,7 +61,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     signal.signal(signal.SIGTERM, lambda *_: os._exit(0))  # its threads wait for messages; nothing is unsaved
     try:
         given = {"bus.endpoint": told.endpoint, "bus.listen": told.listen, "scene.objects": told.objects,
-                 "perception.weights": weights_of(told.weights), "seed": told.seed, "scene.count": told.count,
+                 "perception.weights": weights_folder(told.weights), "seed": told.seed, "scene.count": told.count,
                  "camera.source": told.source or None, "camera.poses": told.poses or None,
                  "camera.intrinsics_px": numbers(told.intrinsics or None)}
         if world_of(told.world).live:  # there is nobody to draw scenes, and nobody waits
@@ -71,13 +71,6 @@ def main(argv: Sequence[str] | None = None) -> None:
     except SaccadeError as error:
         print(f"saccade: {error}", file=sys.stderr)
         sys.exit(EXIT_ERROR)
-
-
-def weights_of(name: str | None) -> Path | None:
-    """A folder, or one in weights/."""
-    if not name:
-        return None
-    return Path(name) if "/" in name else REPOSITORY / "weights" / name
 
 
 def direct(config: Config, world: str, worlds: int, runs: Path, console: Console) -> list[Result]:

@@ -34,6 +34,16 @@ def split_names(names: str | None) -> list[str] | None:
     return None if names is None else [name.strip() for name in names.split(",") if name.strip()]
 
 
+def weights_folder(name: str | Path | None) -> Path | None:
+    """A folder of weights, or the one of that name in weights/."""
+    from shared.config import REPOSITORY
+
+    if not name:
+        return None
+    path = Path(name)
+    return path if path.is_absolute() or path.is_dir() else REPOSITORY / "weights" / path
+
+
 def numbers(text: str | None) -> list[float] | None:
     """The numbers in a,b; their count and size are for the configuration to check."""
     try:

@@ -14,10 +14,10 @@ from rich.table import Table
 
 from deploy.logs.check import missing
 from deploy.moved import Moved
+from deploy.options import weights_folder
 from deploy.replay import Outcome, Replay, prepare, replay_here, replay_on_bus
 from services.recorder.core import LOG_NAME
 from services.replayer.core import Keys, Pace, steps_between
-from shared.config import REPOSITORY
 from shared.errors import SaccadeError
 from shared.topics import FRAME, TOPICS, Topic
 
@@ -76,7 +76,7 @@ def _weights(perception: Path | None) -> dict[str, str]:
     """The configuration of other perception weights: a folder, or the name of one in weights/."""
     if perception is None:
         return {}
-    folder = perception if perception.is_dir() else REPOSITORY / "weights" / perception
+    folder = weights_folder(perception)
     manifest = folder / "manifest.json"
     if not manifest.is_file():
         raise SaccadeError(f"--perception {perception}: {manifest} is not there: give a folder with weights")
