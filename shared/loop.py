@@ -135,7 +135,7 @@ class _Loop:
         before, core = set(self._stepper.core.names), self._stepper.core
         core.share(self._share.take_mine())
         if set(core.names) - before:
-            self._step(None, None, self._stepper.again)
+            self._step(self._service.trigger, None, self._stepper.again)
         whole = core.names == self._stepper.parts
         self.notes = "" if whole else f"answers for {', '.join(core.names) or 'nothing'}"
         self.health.say(note=self.notes)
@@ -158,11 +158,13 @@ class _Loop:
             self.begin_if_due()
 
     def _note_answer(self, topic: Topic, part: str | None, payload: bytes) -> None:
-        """Keeps what another replica said: should that one die, this one can still be asked for it."""
+        """Keeps what another replica said: should that one die, this one can still be asked for it. What is no message
+        is no answer."""
         with suppress(MessageError):
-            stamp = stamp_of(payload)
-            if self._share.answered(topic, part, stamp):
-                self.outbox.keep(topic, part, stamp, payload)
+            if not self._share.is_answered(topic, part, stamp_of(payload)):
+                message = decode(topic.type, payload)
+                self._share.answered(topic, part, message)
+                self.outbox.keep(topic, part, message, payload)
 
     def _take(self, topic: Topic, part: str | None, payload: bytes) -> None:
         self.health.received += 1
@@ -273,7 +275,7 @@ class _Loop:
 
     def _publish(self, outputs: list[Output]) -> None:
         if self._share:
-            outputs = [output for output in outputs if not self._share.is_answered(output)]
+            outputs = [o for o in outputs if not self._share.is_answered(o.topic, o.part, o.message)]
         encoded = []
         for output in outputs:  # all before the first is sent: a step is published as a whole or not at all
             try:
@@ -283,6 +285,6 @@ class _Loop:
         for output, payload in zip(outputs, encoded, strict=True):
             self.outbox.keep(output.topic, output.part, output.message, payload)
             if self._share:
-                self._share.answered(output.topic, output.part, stamp_of(payload))
+                self._share.answered(output.topic, output.part, output.message)
             self._bus.publish(output.topic, output.part, payload)
             self.health.published += 1

@@ -13,7 +13,8 @@ from collections.abc import Iterable
 
 from shared.bus import Bus
 from shared.errors import SaccadeError
-from shared.service import Output, Service
+from shared.messages import Message
+from shared.service import Service
 from shared.topics import Topic
 from shared.wire import Stamp
 
@@ -21,6 +22,7 @@ MEET_S = 0.1  # after so long one that has joined knows who else is there
 JOIN_S = 0.5  # one that has joined lets the others finish what they have begun
 
 Key = tuple[str, str | None]  # topic and part
+Episode = tuple[str, int]  # run and number
 
 
 def shares(parts: Iterable[str], members: Iterable[str]) -> dict[str, str]:
@@ -61,7 +63,7 @@ class Share:
     def __init__(self, service: Service, parts: tuple[str, ...], me: str | None = None) -> None:
         self.me, self._service, self._parts = me or uuid.uuid4().hex, service, parts
         self._members, self._known = frozenset((self.me,)), frozenset((self.me,))
-        self._answered: dict[Key, tuple[str, int, int]] = {}  # of each key: run, episode, step
+        self._answered: dict[Key, tuple[Episode, set[int]]] = {}  # of each key: the newest episode and its steps
 
     def met(self, members: frozenset[str]) -> None:
         """Who is there now, maybe without this one yet; from the bus's thread."""
@@ -78,18 +80,18 @@ class Share:
         owners = shares(self._parts, self._members)
         return tuple(part for part in self._parts if owners[part] == self.me)
 
-    def answered(self, topic: Topic, part: str | None, stamp: Stamp) -> bool:
-        """A message of this service was published; whether it is news."""
-        at, key = (stamp.run, stamp.episode, stamp.step), (topic.name, part)
+    def answered(self, topic: Topic, part: str | None, stamp: Stamp | Message) -> None:
+        """A message of this service was published."""
+        episode, key = (stamp.run, stamp.episode), (topic.name, part)
         known = self._answered.get(key)
-        news = known is None or known[0] != at[0] or known < at
-        if news:
-            self._answered[key] = at
-        return news
+        if known is None or known[0][0] != stamp.run or known[0] < episode:
+            known = self._answered[key] = episode, set()
+        if known[0] == episode:
+            known[1].add(stamp.step)
 
-    def is_answered(self, output: Output) -> bool:
-        """Whether someone has published this output, or a later one of its key."""
-        return self._has(output.topic, output.part, (output.message.run, output.message.episode, output.message.step))
+    def is_answered(self, topic: Topic, part: str | None, stamp: Stamp | Message) -> bool:
+        """Whether someone has published this message."""
+        return self._has(topic, part, (stamp.run, stamp.episode, stamp.step))
 
     def lacks(self, mine: Iterable[str], at: tuple[str, int, int]) -> bool:
         """Whether any of these parts is still to be answered for a step."""
@@ -97,6 +99,5 @@ class Share:
                    for topic in self._service.outputs for part in mine)
 
     def _has(self, topic: Topic, part: str | None, at: tuple[str, int, int]) -> bool:
-        known = self._answered.get((topic.name, part))
-        return known is not None and known[0] == at[0] and known >= at
-
+        episode, steps = self._answered.get((topic.name, part), (None, ()))
+        return episode == at[:2] and at[2] in steps

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
+from contextlib import suppress
 
 import pytest
 
@@ -16,7 +17,7 @@ from shared.process import Inbox
 from shared.replicas import Share, alone_on, shares
 from shared.service import Output, Service
 from shared.topics import FRAME, GOAL, GOAL_PERCEPT, PERCEPT
-from shared.wire import decode, encode, stamp_of
+from shared.wire import MessageError, decode, encode, stamp_of
 from tests.samples import sample
 
 PARTS = ("cup", "jar", "jug", "mug", "pot")
@@ -42,14 +43,15 @@ def test_one_that_dies_leaves_most_objects_where_they_were():
 
 
 def test_what_another_has_answered_is_answered():
-    share = Share(SERVICE, PARTS, "a")
-    message = sample(PERCEPT.type, object="cup", run="r", episode=1, step=4)
-    assert not share.is_answered(Output(PERCEPT, message, "cup"))
-    assert share.answered(PERCEPT, "cup", stamp_of(encode(message)))
-    assert not share.answered(PERCEPT, "cup", stamp_of(encode(message)))
-    assert share.is_answered(Output(PERCEPT, message, "cup"))
-    assert share.lacks(["cup"], ("r", 1, 4))  # the goal's is still to come
-    assert share.lacks(["cup"], ("r", 1, 5))
+    share, message = Share(SERVICE, PARTS, "a"), at(PERCEPT, 4, object="cup")
+    assert not share.is_answered(PERCEPT, "cup", message)
+    share.answered(PERCEPT, "cup", stamp_of(encode(message)))
+    assert share.is_answered(PERCEPT, "cup", message)
+    assert not share.is_answered(PERCEPT, "cup", at(PERCEPT, 3, object="cup"))
+    assert share.lacks(["cup"], ("r", 0, 4))  # the goal's is still to come
+    share.answered(GOAL_PERCEPT, "cup", at(PERCEPT, object="cup"))
+    assert not share.lacks(["cup"], ("r", 0, 4))
+    assert share.lacks(["cup"], ("r", 1, 4))
 
 
 def at(topic, step=0, **values):
@@ -122,8 +124,12 @@ def until(condition):
 def bus():
     bus = Bus()
     bus.seen = []
-    bus.subscribe([PERCEPT, GOAL_PERCEPT], lambda topic, part, payload: bus.seen.append(
-        (topic.name, part, decode(topic.type, payload))))
+
+    def see(topic, part, payload):
+        with suppress(MessageError):
+            bus.seen.append((topic.name, part, decode(topic.type, payload)))
+
+    bus.subscribe([PERCEPT, GOAL_PERCEPT], see)
     outbox = Outbox()
     bus.answer([FRAME, GOAL], outbox.answer)
 
@@ -180,6 +186,18 @@ def test_what_a_dead_one_said_the_others_still_know(bus):
     kept = {(k.topic.name, k.part) for k in bus.recall([PERCEPT, GOAL_PERCEPT], ("r", 0, 0))}
     assert {part for _, part in kept} == set(PARTS)
     first.inbox.stop()
+
+
+def test_what_is_no_message_is_no_answer(bus):
+    replica = Replica(bus)
+    payload = encode(at(PERCEPT, object="cup"))
+    for broken in (payload[:-1], payload.replace(b"presence", b"absence!", 1)):
+        bus.publish(PERCEPT, "cup", broken)
+    bus.seen.clear()
+    bus.publish_goal()
+    bus.show(0)
+    once(bus, 0)
+    replica.inbox.stop()
 
 
 def test_a_second_source_is_refused():
