@@ -20,7 +20,7 @@ from shared.config import Config
 from shared.outbox import Outbox
 from shared.reading import RunReader
 from shared.recording import RunLog
-from shared.topics import ACTION, PERCEPT, STATUS
+from shared.topics import ACTION, GOAL, PERCEPT, RESULT, STATUS
 from shared.wire import encode
 from tests.samples import sample
 
@@ -151,6 +151,18 @@ def test_what_was_lost_stands_in_the_log_before_what_told_of_it(tmp_path):
                 recorder.bus.publish(ACTION, None, encode(message))
         time.sleep(1.0)  # longer than it takes to reach the disk
     assert [m.seq for t, _, m in RunReader(tmp_path / "run" / "run.mcap") if t == ACTION] == [0, 1, 2]
+
+
+def test_what_holds_for_an_episode_and_was_lost_is_asked_for_when_it_ends(tmp_path):
+    outbox = Outbox()
+    with closing(RecorderProcess(tmp_path / "run")) as recorder:
+        recorder.bus.answer([GOAL, RESULT], outbox.answer)
+        for topic in (GOAL, RESULT):
+            message = sample(topic.type, run="run", episode=0, step=0, seq=0)
+            outbox.keep(topic, None, message, encode(message))
+        recorder.bus.publish(RESULT, None, encode(message))
+        time.sleep(1.0)  # longer than it takes to reach the disk
+    assert {t for t, _, _ in RunReader(tmp_path / "run" / "run.mcap")} >= {GOAL, RESULT}
 
 
 def test_a_recorder_without_room_says_so_and_the_bus_goes_on(tmp_path):

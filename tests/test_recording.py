@@ -17,7 +17,7 @@ from shared.messages import field_types
 from shared.migrations import FORMAT
 from shared.reading import RunReader
 from shared.recording import RecordingStopped, RunLog, json_schema
-from shared.topics import ACTION, BELIEF, FRAME, PERCEPT, STATUS, TOPICS, TRUTH
+from shared.topics import ACTION, BELIEF, FRAME, GOAL, PERCEPT, RESULT, STATUS, TOPICS, TRUTH
 from shared.wire import encode
 from tests.samples import sample
 
@@ -219,3 +219,16 @@ def test_missing_steps_and_topics_are_reported(tmp_path):
     assert [at[2] for at in missing(tmp_path / "late.mcap").absent] == [0, 1]
     write(tmp_path / "good.mcap", steps(4, FRAME, PERCEPT, ACTION, TRUTH)).close()
     assert missing(tmp_path / "good.mcap").complete
+
+
+def test_what_holds_for_an_episode_is_missed_where_another_has_it(tmp_path):
+    """Only an episode that is over owes a result."""
+    def episode(number, *latched, done=True):
+        truth = sample(TRUTH.type, run="r", episode=number, step=0, seq=0, done=done)
+        return [(TRUTH, None, truth)] + [(topic, None, sample(topic.type, run="r", episode=number, step=0, seq=0))
+                                         for topic in latched]
+
+    messages = episode(0, GOAL, RESULT) + episode(1, RESULT) + episode(2, GOAL) + episode(3, GOAL, done=False)
+    write(tmp_path / "run.mcap", messages).close()
+    absent = missing(tmp_path / "run.mcap").absent
+    assert absent == [("r", 1, 0, "saccade/test/goal"), ("r", 2, 0, "saccade/test/result")]

@@ -11,7 +11,7 @@ from pathlib import Path
 from deploy.logs.cut import Range, range_of
 from shared.reading import RunReader
 from shared.sequences import Sequences
-from shared.topics import TOPICS, TRUTH
+from shared.topics import RESULT, TOPICS, TRUTH
 
 MOST_STRETCHES = 6  # of steps that are named one by one
 
@@ -57,6 +57,7 @@ def missing(path: Path) -> Missing:
     that was cut out of another only its range is expected. Where nobody waited (`bus.live`) no step needs an answer."""
     report, reader, sequences = Missing(), RunReader(path), None
     steps: dict[tuple[str, int], dict[int, set[str]]] = {}
+    held: dict[tuple[str, int], set[str]] = {}  # of each episode: keys that hold for all of it
     done: set[tuple[str, int, int]] = set()
     for topic, part, message in reader:
         sequences = sequences or Sequences(from_start=True, cut=range_of(reader) is not None)
@@ -65,12 +66,17 @@ def missing(path: Path) -> Missing:
         lost = sequences.take(topic, part, message)
         report.repeated += lost is None
         report.heartbeats += 0 if topic.in_step else lost or 0
-        if topic.in_step and not topic.latched:
+        if topic.latched:
+            held.setdefault((message.run, message.episode), set()).add(key)
+        elif topic.in_step:
             steps.setdefault((message.run, message.episode), {}).setdefault(message.step, set()).add(key)
             if topic == TRUTH and message.done:
                 done.add((message.run, message.episode, message.step))
     live = json.loads(reader.configuration or "{}").get("bus", {}).get("live", False)
-    report.absent = [] if live else _absent(steps, done, range_of(reader))
+    if not live:
+        judged = {(run, episode) for run, episode, _ in done}
+        report.absent = sorted(_absent(steps, done, range_of(reader)) + _not_held(
+            steps, held, {episode for episode in steps if episode not in judged}, RESULT.key(reader.world)))
     if sequences is not None:
         report.lost = {TOPICS[name].key(reader.world, part): lost for (name, part), lost in sequences.missing.items()}
     report.refused, report.cut = reader.refused, reader.cut
@@ -86,7 +92,15 @@ def _absent(steps: dict[tuple[str, int], dict[int, set[str]]], done: set[tuple[s
         expected = range(last + 1) if kept is None else range(kept.start, max(kept.end or 0, last) + 1)
         absent += [(*episode, step, key) for step in expected if (*episode, step) not in done
                    for key in keys - there.get(step, set())]
-    return sorted(absent)
+    return absent
+
+
+def _not_held(steps: dict[tuple[str, int], dict[int, set[str]]], held: dict[tuple[str, int], set[str]],
+              unfinished: set[tuple[str, int]], result: str) -> list[tuple[str, int, int, str]]:
+    """What one episode has and another lacks; only one that is over has a result."""
+    keys = set().union(*held.values())
+    return [(*episode, 0, key) for episode in steps for key in keys - held.get(episode, set())
+            if key != result or episode not in unfinished]
 
 
 def abbreviated(numbers: Iterable[int]) -> str:
