@@ -4,10 +4,12 @@ replicas of perception, and with and without shared memory between the container
 from __future__ import annotations
 
 import json
+import math
 import os
 import subprocess
 import sys
 import tempfile
+import time
 from functools import partial
 from pathlib import Path
 
@@ -16,11 +18,15 @@ import yaml
 from rich.console import Console
 from rich.table import Table
 
+from services.perception.core import SceneCCN
+from services.simulator.objects import names_of
 from shared.config import REPOSITORY
+from shared.geometry import INTRINSICS_PX
 from shared.reading import RunReader
-from shared.topics import STATUS, TRUTH
+from shared.topics import TRUTH
+from shared.weights import Weights
 
-ROUNDS, SCENES = 3, 8
+ROUNDS, SCENES, REPEATS = 3, 8, 60
 REPLICAS = (1, 2, 3)
 PROJECT = f"saccade-bench-{os.getpid()}"
 
@@ -31,17 +37,28 @@ def compose(*arguments: str) -> None:
                    stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
 
-def run(replicas: int, files: tuple[str, ...] = ()) -> tuple[float, float]:
-    """Steps per second, and milliseconds of perception per step (the median over all replicas)."""
+def run(replicas: int, files: tuple[str, ...] = ()) -> float:
+    """Steps per second."""
     chosen = [argument for name in files for argument in ("-f", name)]
     compose(*chosen, "up", "--scale", f"perception={replicas}")
     compose(*chosen, "down", "--volumes")
-    truths_ns = []
-    for topic, _, _, time_ns in (reader := RunReader(REPOSITORY / "runs" / "latest" / "run.mcap")).entries():
-        if topic == TRUTH:
-            truths_ns.append(time_ns)
-    milliseconds = [m.milliseconds for topic, part, m in reader if topic == STATUS and part == "perception"]
-    return (len(truths_ns) - 1) / (truths_ns[-1] - truths_ns[0]) * 1e9, float(np.median([m for m in milliseconds if m]))
+    entries = RunReader(REPOSITORY / "runs" / "latest" / "run.mcap").entries()
+    truths_ns = [entry.log_time_ns for entry in entries if entry.topic == TRUTH]
+    return (len(truths_ns) - 1) / (truths_ns[-1] - truths_ns[0]) * 1e9
+
+
+def perception_ms(objects: int) -> float:
+    """Of one image and so many objects, with a core to itself."""
+    import torch
+
+    torch.set_num_threads(1)
+    names, image = names_of("pantry")[:objects], np.random.default_rng(0).integers(0, 255, (480, 480, 3), np.uint8)
+    networks, spent_ms = SceneCCN(Weights(REPOSITORY / "weights" / "pantry"), names), []
+    for _ in range(REPEATS):
+        start = time.perf_counter()
+        networks.see(image, INTRINSICS_PX, (0.0, 0.0, 1.0))
+        spent_ms.append((time.perf_counter() - start) * 1e3)
+    return float(np.median(spent_ms))
 
 
 def without_shared_memory(folder: Path) -> str:
@@ -64,13 +81,14 @@ def main() -> None:
         for number in range(ROUNDS):
             for name, measure in ways[number % len(ways):] + ways[:number % len(ways)]:
                 found[name].append(measure())
-    rates = {name: float(np.median([rate for rate, _ in values])) for name, values in found.items()}
-    spent_ms = {name: float(np.median([ms for _, ms in values])) for name, values in found.items()}
-    first = ways[0][0]
-    table = Table("way", "steps per s", "of the first", "perception, ms a step", "projected with a core each")
-    for name, rate in rates.items():
-        projected = 1 / (1 / rates[first] - (spent_ms[first] - spent_ms[name]) / 1e3)
-        table.add_row(name, f"{rate:.2f}", f"{rate / rates[first]:.3f}", f"{spent_ms[name]:.1f}",
+    rates = {name: float(np.median(values)) for name, values in found.items()}
+    first, objects = ways[0][0], len(names_of("pantry"))
+    alone_ms = {k: perception_ms(k) for k in sorted({math.ceil(objects / n) for n in REPLICAS})}
+    table = Table("way", "steps per s", "of the first", "objects each", "perception, ms", "projected: a core each")
+    for (name, rate), replicas in zip(rates.items(), (*REPLICAS, 1), strict=True):
+        share = math.ceil(objects / replicas)
+        projected = 1 / (1 / rates[first] - (alone_ms[objects] - alone_ms[share]) / 1e3)
+        table.add_row(name, f"{rate:.2f}", f"{rate / rates[first]:.3f}", str(share), f"{alone_ms[share]:.1f}",
                       f"{projected / rates[first]:.2f}")
     Console().print(table)
     if len(sys.argv) > 1:
