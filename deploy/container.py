@@ -27,7 +27,7 @@ WORLD_VARIABLE, WAIT_VARIABLE = "SACCADE_WORLD", "SACCADE_WAIT"
 LATEST, OVER = "latest", "over"  # in the folder of the runs, and in the one of a run
 ONE_FOR_ALL = ("router",)  # worlds share it
 POLL_S = 0.2
-ROUTER_S = "60"  # containers start in any order
+ROUTER_S = 60.0  # for the router to answer: containers start in any order
 EXIT_AGAIN = 1
 
 
@@ -69,7 +69,7 @@ class Container:
         self._children: dict[Path, subprocess.Popen] = {}
 
     def _start(self, world: Path) -> subprocess.Popen:
-        environment = {**dict.fromkeys(VARIABLES, "1"), **KEEP_PAGES, ROUTER_WAIT_VARIABLE: ROUTER_S, **os.environ,
+        environment = {**dict.fromkeys(VARIABLES, "1"), **KEEP_PAGES, ROUTER_WAIT_VARIABLE: str(ROUTER_S), **os.environ,
                        LAUNCHER_VARIABLE: str(os.getpid()),
                        HEARTBEAT_VARIABLE: str(heartbeat_file(world.name))}
         return subprocess.Popen([sys.executable, "-m", f"services.{self._name}", "--config", world / CONFIG_NAME],

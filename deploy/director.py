@@ -23,7 +23,7 @@ from typing import Any
 
 from rich.console import Console
 
-from deploy.container import LATEST, OVER, heartbeat_file, runs_folder
+from deploy.container import LATEST, OVER, ROUTER_S, heartbeat_file, runs_folder
 from deploy.display import LINE_EVERY, Progress, line
 from deploy.ending import ending
 from deploy.launch import LOG_NAME, Graph, follow, messages, resolve
@@ -39,7 +39,6 @@ from shared.topics import BELIEF, FRAME, PLAN, RESULT, STATUS, TRUTH, Topic
 
 SHOWN = (PLAN, BELIEF, STATUS, RESULT)
 BEAT_S = 0.5
-ROUTER_S = 60.0  # containers start one after the other
 
 
 def main(argv: Sequence[str] | None = None) -> None:

@@ -16,6 +16,7 @@ from pathlib import Path
 
 from deploy.zenoh.access import access_control, users
 from shared.errors import SaccadeError
+from shared.process import EXIT_ERROR
 
 DAYS = 825
 AUTHORITY, ROUTER = "authority", "router"
@@ -88,7 +89,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         make(told.folder, told.host, told.where)
     except SaccadeError as error:
         print(f"saccade: {error}", file=sys.stderr)
-        sys.exit(2)
+        sys.exit(EXIT_ERROR)
 
 
 if __name__ == "__main__":
