@@ -14,6 +14,7 @@ from collections.abc import Iterable
 from shared.bus import Bus
 from shared.errors import SaccadeError
 from shared.messages import Message
+from shared.sequences import Episode, Key
 from shared.service import Service
 from shared.topics import Topic
 from shared.wire import Stamp
@@ -21,8 +22,6 @@ from shared.wire import Stamp
 MEET_S = 0.1  # after so long one that has joined knows who else is there
 JOIN_S = 0.5  # one that has joined lets the others finish what they have begun
 
-Key = tuple[str, str | None]  # topic and part
-Episode = tuple[str, int]  # run and number
 
 
 def shares(parts: Iterable[str], members: Iterable[str]) -> dict[str, str]:
@@ -44,7 +43,7 @@ def alone_on(bus: Bus, name: str) -> None:
     me, others = f"{time.time_ns():020d}-{uuid.uuid4().hex}", set()
     bus.join(name, me, others.update)
     time.sleep(MEET_S)
-    if min(others) != me:
+    if min({me, *others}) != me:
         raise SaccadeError(f"another {name} is in this world already, and a world has one: stop it, or choose another "
                            "world (bus.world)")
 

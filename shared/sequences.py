@@ -81,7 +81,11 @@ class Sequences:
         """The first episode of which something has not come; 0 where all has."""
         return min((episode for lost in self._missing.values() for _, episode, _ in lost), default=0)
 
+    def has_begun(self, key: Key, run: str, episode: int) -> bool:
+        """Whether any message of this key in that episode was there."""
+        return (run, episode) in self._next.get(key, {})
+
     def begins(self, topic: Topic, part: str | None, message: Message | Stamp) -> bool:
         """Whether this is the first message of its key in a later episode than those before it."""
-        known = self._next.get((topic.name, part), {})
-        return topic.in_step and bool(known) and (message.run, message.episode) not in known
+        key = topic.name, part
+        return topic.in_step and key in self._next and not self.has_begun(key, message.run, message.episode)

@@ -74,9 +74,9 @@ def missing(path: Path) -> Missing:
                 done.add((message.run, message.episode, message.step))
     live = json.loads(reader.configuration or "{}").get("bus", {}).get("live", False)
     if not live:
-        judged = {(run, episode) for run, episode, _ in done}
-        report.absent = sorted(_absent(steps, done, range_of(reader)) + _not_held(
-            steps, held, {episode for episode in steps if episode not in judged}, RESULT.key(reader.world)))
+        over = {(run, episode) for run, episode, _ in done}
+        report.absent = sorted(_absent(steps, done, range_of(reader))
+                               + _not_held(steps, held, over, RESULT.key(reader.world)))
     if sequences is not None:
         report.lost = {TOPICS[name].key(reader.world, part): lost for (name, part), lost in sequences.missing.items()}
     report.refused, report.cut = reader.refused, reader.cut
@@ -96,11 +96,11 @@ def _absent(steps: dict[tuple[str, int], dict[int, set[str]]], done: set[tuple[s
 
 
 def _not_held(steps: dict[tuple[str, int], dict[int, set[str]]], held: dict[tuple[str, int], set[str]],
-              unfinished: set[tuple[str, int]], result: str) -> list[tuple[str, int, int, str]]:
+              over: set[tuple[str, int]], result: str) -> list[tuple[str, int, int, str]]:
     """What one episode has and another lacks; only one that is over has a result."""
     keys = set().union(*held.values())
     return [(*episode, 0, key) for episode in steps for key in keys - held.get(episode, set())
-            if key != result or episode not in unfinished]
+            if key != result or episode in over]
 
 
 def abbreviated(numbers: Iterable[int]) -> str:

@@ -8,7 +8,6 @@ import itertools
 import platform
 import sys
 import time
-from collections import defaultdict
 from collections.abc import Sequence
 from functools import partial
 from importlib import metadata
@@ -23,11 +22,9 @@ from shared.process import Health, Heartbeat, Inbox, Item, run_process
 from shared.provenance import commit
 from shared.reading import RunReader
 from shared.recording import CUT, FLUSH_S, RecordingStopped, RunLog
-from shared.sequences import Sequences
+from shared.sequences import Key, Sequences
 from shared.topics import RESULT, TOPICS, Topic
 from shared.wire import MessageError, decode
-
-Key = tuple[str, str | None]  # topic and part
 
 NAME = "recorder"
 LOG_NAME = "run.mcap"
@@ -65,7 +62,6 @@ class Recorder:
         self.health, self._bus, self._run = Health(NAME), bus, config.run or folder.name
         self._sequences = Sequences(from_start=True, cut=config.bus.first_step > 0)
         self._last: dict[Key, tuple[int, int]] = {}  # of each key: episode and step
-        self._held: dict[Key, set[int]] = defaultdict(set)  # of each latched key: the episodes that have it
         self._names = config.scene.names or ()
         self._asked_s, self._ask_again_s, self._news_s = 0.0, ASKED_AGAIN_S, time.monotonic()
         self.log = self._open(folder / LOG_NAME, config)
@@ -151,7 +147,7 @@ class Recorder:
         """What holds for a whole episode comes once in it: no number tells that it was lost."""
         for topic in (topic for topic in TOPICS.values() if topic.latched):
             keys = [(topic.name, name) for name in self._names] if topic.parts else [(topic.name, None)]
-            if any(episode not in self._held[key] for key in keys):
+            if not all(self._sequences.has_begun(key, self._run, episode) for key in keys):
                 self._write_kept([topic], (episode, 0))
 
     def _ask_for_missing(self) -> None:
@@ -191,8 +187,6 @@ class Recorder:
             if topic.in_step and message.run == self._run:
                 key = topic.name, part
                 self._last[key] = max(self._last.get(key, (0, 0)), (message.episode, message.step))
-                if topic.latched:
-                    self._held[key].add(message.episode)
         log.write(topic, part, payload, sequence=message.seq if message else 0, log_time_ns=time_ns)
 
 
