@@ -146,8 +146,7 @@ class Stepper:
 
     def _limit(self) -> None:
         while len(self._slots) > MAX_PENDING:
-            self._slots.pop(next(iter(self._slots)))
-            self.skipped += 1
+            self._skip(next(iter(self._slots)))
 
     def _lacks(self, at: tuple[str, int, int]) -> list[tuple[str, str | None]]:
         slot, latched = self._slots.get(at, {}), self._latched.get(at[:2], {})
@@ -201,8 +200,11 @@ class Stepper:
         """Drops the step and those before it: of one key all came in order, so what these lack is lost."""
         del self._slots[at]
         for old in [a for a in self._slots if a[0] in self._past_runs or (a[0] == at[0] and a[1:] < at[1:])]:
-            del self._slots[old]
-            self.skipped += 1
+            self._skip(old)
+
+    def _skip(self, at: tuple[str, int, int]) -> None:
+        del self._slots[at]
+        self.skipped += not self._source  # what a source skips are images, and it counts them itself
 
     def _emit(self, outputs: Iterable[Output] | None) -> list[Output]:
         stamped = []

@@ -12,6 +12,7 @@ from shared.stepper import Stepper, settle
 from shared.topics import ACTION, FRAME, GOAL, PERCEPT, PLAN, TRUTH
 from shared.wire import MessageError, encode
 from tests.fakes.services import SIMULATOR, FakeSimulator
+from tests.fakes.timed import TIMED, FakeCamera
 from tests.samples import sample
 
 PARTS = ("mug", "can")
@@ -125,6 +126,17 @@ def test_a_second_message_of_a_step_and_a_wrong_step_for_a_source_are_refused():
         offer(simulator, ACTION, step=3)
     assert offer(simulator, ACTION, step=0)
     assert not offer(simulator, ACTION, step=0)
+
+
+def test_an_action_that_a_camera_went_past_is_no_image_that_it_skipped():
+    camera = FakeCamera(3, 1.0)
+    stepper = Stepper(TIMED, camera, (), source=True, live=True)
+    stepper.begin("r", 0)
+    stepper.offer(ACTION, None, sample(ACTION.type, run="r", episode=0, step=0))
+    stepper.tick()
+    assert offer(stepper, ACTION, step=1)
+    assert stepper.skipped == 0
+    assert not offer(stepper, ACTION, step=0)
 
 
 def test_stray_steps_do_not_pile_up():
