@@ -61,7 +61,10 @@ class Percept(Message):
     `pixel` is the centre (u, v) of the object; `scale` = 0.40 m / range; the deviations are calibrated.
     `reconstruction_error`: squared error of the decoded crop where the mask says that the object is seen, summed. The
     latent pose is seen from the camera. On `goal_percept` the camera's pose is unknown: the identity stands for it.
+    `mask_bits`: whether the object is seen in each of MxM cells of the image, a row of cells packed into bytes.
     """
+
+    VERSION: ClassVar[int] = 2
 
     object: str
     presence: float
@@ -74,6 +77,13 @@ class Percept(Message):
     intrinsics_px: array("f8", 4)
     world_from_camera: array("f8", 4, 4)
     reconstruction_error: float = 0.0
+    mask_bits: array("u1", "M", "B") | None = None
+
+    def mask(self) -> np.ndarray | None:
+        """Where in the image the object is seen: truth values [M, M]."""
+        if self.mask_bits is None:
+            return None
+        return np.unpackbits(self.mask_bits, axis=1)[:, :len(self.mask_bits)].astype(bool)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,7 +123,12 @@ class Belief(Message):
 
 @dataclass(frozen=True, kw_only=True)
 class Plan(Message):
-    """The chosen viewpoint and the terms of its expected free energy G (paper, equation 5); G is their sum."""
+    """The chosen viewpoint and the terms of its expected free energy G (paper, equation 5); G is their sum.
+
+    `best_eyes_m`, `best_g`: the best of the candidates it was chosen from, best first, and their G (nats).
+    """
+
+    VERSION: ClassVar[int] = 2
 
     target: str
     mode: str
@@ -127,6 +142,8 @@ class Plan(Message):
     goal_confidence: float  # that the goal image shows the target
     believed_distance_m: float  # from here to the goal's viewpoint as believed; infinite is not allowed: -1 if unknown
     arrived: bool
+    best_eyes_m: array("f4", "N", 3) | None = None
+    best_g: array("f4", "N") | None = None
 
     @property
     def g(self) -> float:

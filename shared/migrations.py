@@ -12,6 +12,7 @@ from typing import Any
 
 import msgpack
 
+from shared import messages as m
 from shared.errors import SaccadeError
 from shared.topics import Topic
 
@@ -19,6 +20,7 @@ Fields = dict[str, Any]
 Change = Callable[[Topic, str | None, Fields], Fields]
 
 OLDEST = 1  # of logs that do not say
+ADDED = {m.Percept: ("mask_bits",), m.Plan: ("best_eyes_m", "best_g")}  # fields that older logs do not have: None
 
 
 def count_in_episodes() -> Change:
@@ -34,7 +36,17 @@ def count_in_episodes() -> Change:
     return change
 
 
-CHANGES: tuple[Callable[[], Change], ...] = (count_in_episodes,)
+def with_masks_and_candidates() -> Change:
+    """2 to 3: percepts say where in the image they are from, plans what they were chosen from."""
+    def change(topic: Topic, part: str | None, fields: Fields) -> Fields:
+        if topic.type not in ADDED:
+            return fields
+        return fields | {"version": 2} | dict.fromkeys(ADDED[topic.type])
+
+    return change
+
+
+CHANGES: tuple[Callable[[], Change], ...] = (count_in_episodes, with_masks_and_candidates)
 FORMAT = OLDEST + len(CHANGES)
 
 

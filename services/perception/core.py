@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from services.perception.cropping import Cropper, Window
 from services.perception.networks import INPUT_PX, Extraction, Identity, tally
 from services.perception.paper import PaperSceneCCN
-from services.perception.seen import Seen
+from services.perception.seen import Seen, bits
 from shared.config import Config
 from shared.generative_model import Decoder, Encoder, Stacked
 from shared.messages import Frame, Goal, Percept
@@ -58,7 +58,7 @@ class SceneCCN:
         deviation = log_std.exp().double().numpy()
         side_px = 2 * before.half_tangent * float(np.asarray(intrinsics_px)[0])
         return Seen(presence, window.pixels, side_px * deviation[:, :2].mean(1), window.scales, deviation[:, 2],
-                    mean.numpy(), std.numpy(), error.double().numpy())
+                    mean.numpy(), std.numpy(), error.double().numpy(), bits((masks > 0).numpy()))
 
 
 def model_of(weights: Weights, names: tuple[str, ...], passes: int) -> SceneCCN | PaperSceneCCN:
@@ -116,7 +116,7 @@ def percept(source: Frame | Goal, name: str, seen: Seen, k: int, world_from_came
         pixel=seen.pixel[k], pixel_std=float(seen.pixel_std[k]), scale=float(seen.scale[k]),
         log_scale_std=float(seen.log_scale_std[k]), latent_mean=seen.latent_mean[k], latent_std=seen.latent_std[k],
         intrinsics_px=np.asarray(source.intrinsics_px), world_from_camera=np.asarray(world_from_camera),
-        reconstruction_error=float(seen.reconstruction_error[k]))
+        reconstruction_error=float(seen.reconstruction_error[k]), mask_bits=seen.mask_bits[k])
 
 
 def build(config: Config) -> Perception:

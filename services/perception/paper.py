@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
-from services.perception.seen import Seen
+from services.perception.seen import Seen, bits
 from shared.generative_model import CROP_PX, Stacked, conv_stack, decoder_of, encoder_of
 from shared.geometry import IMAGE_SIZE_PX, INTRINSICS_PX, REFERENCE_RANGE_M
 from shared.weights import Weights
@@ -111,10 +111,11 @@ class PaperSceneCCN:
         """Infers all objects from an image [H, H, 3]. The paper's crops neither know the camera nor which way is up."""
         image = torch.from_numpy(np.array(rgb)).permute(2, 0, 1).float() / 255.0
         everyone = image.expand(len(self.cards), 1, -1, -1, -1)
-        _, center, scale, crops, logit = (x[:, 0] for x in self.extraction(everyone))
+        whole, center, scale, crops, logit = (x[:, 0] for x in self.extraction(everyone))
         mean, std = (x[:, 0] for x in self.encoder(crops[:, None, :3]))
         masked, mask = crops[:, :3], crops[:, 3:]
         error = ((self.decoder(mean[:, None])[:, 0] * mask - masked) ** 2).sum((1, 2, 3))
         pixel = (center.double().numpy() + 1) / 2 * rgb.shape[1]
+        seen_in = bits((F.adaptive_avg_pool2d(whole[:, 0], MASK_PX) > 0.5).numpy())
         return Seen(logit.sigmoid().double().numpy(), pixel, self.pixel_std, scale.double().numpy(), self.log_scale_std,
-                    mean.numpy(), std.numpy(), error.double().numpy())
+                    mean.numpy(), std.numpy(), error.double().numpy(), seen_in)

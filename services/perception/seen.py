@@ -8,6 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 
+def bits(masks: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """Masks [K, M, M], their rows packed into bytes [K, M, B]."""
+    return np.packbits(masks, axis=-1)
+
+
 @dataclass(frozen=True)
 class Seen:
     """What the networks made of one image, for K objects: see `Percept` for the units."""
@@ -20,3 +25,4 @@ class Seen:
     latent_mean: NDArray[np.float32]
     latent_std: NDArray[np.float32]
     reconstruction_error: NDArray[np.float64]
+    mask_bits: NDArray[np.uint8]

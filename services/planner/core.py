@@ -44,6 +44,7 @@ VISITED_M, VISITED_RAD = 0.05, 0.35  # around a view that turned out not to be t
 VISITED_COST = 6.0  # nats
 DOUBT_LIMIT = 2.5
 SURE = 0.6  # that this is the goal's view, before the agent says so
+PUBLISHED = 64  # candidates that a plan tells of
 PEAK_CELLS = (2, 4)  # the posterior's peak is averaged over so many cells of elevation and azimuth to each side
 
 
@@ -157,7 +158,10 @@ class Planner:
         else:
             self.viewpoint = look_at(clip(eyes[chosen], spheres), gazes[chosen])
         self.age = 0
-        self.plan = self._plan(stamp, mode, gazes[chosen], terms, chosen)
+        leading = np.argsort(cost)[:PUBLISHED]
+        self.plan = replace(self._plan(stamp, mode, gazes[chosen], terms, chosen),
+                            best_eyes_m=eyes[leading].astype(np.float32),
+                            best_g=terms.total[leading].astype(np.float32))
 
     @property
     def _doubt(self) -> float:
