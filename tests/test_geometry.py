@@ -20,6 +20,7 @@ from shared.geometry import (
     unit,
     wrap,
 )
+from shared.windows import Window
 
 
 @pytest.fixture
@@ -127,3 +128,16 @@ def test_fibonacci_points_lie_on_the_upper_hemisphere_and_apart():
     assert (points[:, 2] > 0).all()
     distances = np.linalg.norm(points[:, None] - points[None], axis=-1) + 10 * np.eye(500)
     assert distances.min(axis=0).min() > 0.5 * np.sqrt(2 * np.pi / 500)
+
+
+def test_a_crops_cells_and_the_images_pixels_find_one_another():
+    """Also of an object far from the optical axis; what is behind a crop's camera is nowhere."""
+    up = look_at((0.4, 0.1, 0.5), (0.0, 0.0, 0.0))[2, :3]
+    window = Window(np.array([[60.0, 400.0], [246.0, 232.0]]), np.array([0.8, 1.3]), np.array([0.25, 0.1]))
+    pixels = window.pixels_of(16, INTRINSICS_PX, up)
+    cells = (np.arange(16) + 0.5) / 8 - 1
+    for k in range(2):
+        back = window.crop_of(pixels[k].reshape(-1, 2), INTRINSICS_PX, up)[k].reshape(16, 16, 2)
+        assert np.allclose(back, np.stack(np.meshgrid(cells, cells), axis=-1), atol=1e-9)
+        assert np.allclose(window.crop_of(window.pixels, INTRINSICS_PX, up)[k, k], 0.0, atol=1e-9)
+    assert np.isnan(window.crop_of([[-1e5, 232.0]], INTRINSICS_PX, up)[0]).all()

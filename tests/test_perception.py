@@ -5,12 +5,13 @@ import pytest
 import torch
 
 from services.perception.core import SceneCCN
-from services.perception.cropping import Cropper, Window
+from services.perception.cropping import Cropper
 from services.simulator.objects import load_mesh, names_of
 from services.simulator.world import World
 from shared.config import REPOSITORY
 from shared.geometry import INTRINSICS_PX, direction, look_at, project
 from shared.weights import Weights
+from shared.windows import Window
 
 NAMES = names_of("pantry")
 

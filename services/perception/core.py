@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from numpy.typing import ArrayLike, NDArray
 
-from services.perception.cropping import Cropper, Window
+from services.perception.cropping import Cropper
 from services.perception.networks import INPUT_PX, Extraction, Identity, tally
 from services.perception.paper import PaperSceneCCN
 from services.perception.seen import Seen, bits
@@ -19,6 +19,7 @@ from shared.messages import Frame, Goal, Percept
 from shared.service import Inputs, Output, Service
 from shared.topics import FRAME, GOAL, GOAL_PERCEPT, PERCEPT
 from shared.weights import Weights
+from shared.windows import Window
 
 SERVICE = Service("perception", inputs=(FRAME, GOAL), trigger=FRAME, outputs=(PERCEPT, GOAL_PERCEPT),
                   divisible=True)
