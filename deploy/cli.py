@@ -13,6 +13,7 @@ import typer
 from deploy.logs.cli import app as logs
 from deploy.options import configured, numbers, parse_value, split_names
 from deploy.threads import prefer_one_thread
+from deploy.views import app as views
 from shared.errors import SaccadeError
 
 EXIT_ERROR, EXIT_INTERRUPTED = 2, 130
@@ -20,6 +21,7 @@ EXIT_ERROR, EXIT_INTERRUPTED = 2, 130
 app = typer.Typer(name="saccade", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
                   help="An active-vision agent: it looks, believes and moves until it sees the goal image.")
 app.add_typer(logs, name="log")
+app.add_typer(views)
 
 Objects = Annotated[Literal["pantry", "ycb"] | None, typer.Option(help="object set [default: pantry]")]
 Names = Annotated[str | None, typer.Option(help="only these objects of the set: a,b", metavar="NAMES")]
@@ -51,6 +53,7 @@ def run(*, objects: Objects = None, names: Names = None, scenes: ScenesFile = No
         rate: Annotated[float | None, typer.Option(help="images a second of a folder or webcam [default: 10]")] = None,
         loop: Annotated[bool, typer.Option("--loop", help="from the first image again after the last")] = False,
         config: ConfigFile = None, values: Values = None,
+        view: Annotated[bool, typer.Option("--view", help="show it in a browser, see `saccade view`")] = False,
         plain: Annotated[bool, typer.Option("--plain", help="lines instead of the live display")] = False) -> None:
     """Run the agent and log everything: run.mcap, config.json, picture.png."""
     from deploy.run import run as run_agent
@@ -60,7 +63,7 @@ def run(*, objects: Objects = None, names: Names = None, scenes: ScenesFile = No
              "scene.goal_image": goal, "scene.explore": explore or None, "bus.kind": bus,
              "perception.weights": weights, "camera.source": source, "camera.poses": poses,
              "camera.intrinsics_px": numbers(intrinsics), "camera.rate_hz": rate, "camera.loop": loop or None}
-    run_agent(configured(config, given, values), agent=agent, out=out, plain=plain, world=world)
+    run_agent(configured(config, given, values), agent=agent, out=out, plain=plain, world=world, view=view)
 
 
 @app.command()
@@ -143,20 +146,6 @@ def report(*, results: Annotated[list[Path], typer.Argument(
     from deploy.report import report as write_report
 
     write_report(results, out, failures=failures, reruns=not no_reruns, weights=weights, jobs=jobs, console=Console())
-
-
-@app.command()
-def picture(log: Annotated[Path, typer.Argument(metavar="RUN", help="folder of a run, or its log")],
-            out: Annotated[Path | None, typer.Option(help="file [default: picture.png beside the log]")] = None,
-            episode: Annotated[int | None, typer.Option(min=0, help="which one [default: the last]")] = None) -> None:
-    """Draw the picture of a run from its log once more."""
-    from deploy.picture import draw
-    from deploy.run import LOG_NAME, PICTURE_NAME
-
-    file = log / LOG_NAME if log.is_dir() else log
-    target = out or file.with_name(PICTURE_NAME)
-    draw(file, target, episode)
-    print(f"written to {target}")
 
 
 @app.command()

@@ -40,8 +40,26 @@ ROUTER, *SERVICES = PROCESSES = tuple(Process(name, f"services.{name}") for name
 def launch(config: Config, run_dir: Path, on_message: OnMessage | None = None,
            processes: Sequence[Process] = PROCESSES, say: Callable[[str], None] | None = None,
            topics: Sequence[Topic] | None = None) -> list[Result]:
-    """Runs all episodes, one process per service, and returns their results in order, none where nobody judges; the log
-    is `run_dir`/run.mcap. A run ends when its source has finished and what it sent has been worked off.
+    """`launched` without a look at what stays when the run is over."""
+    with launched(config, run_dir, on_message, processes, say, topics) as ended:
+        return ended.results
+
+
+@dataclass(frozen=True)
+class Ended:
+    """A run that is over: its results, and whether a process that looks on is still there."""
+
+    results: list[Result]
+    runs: Callable[[str], bool]
+
+
+@contextmanager
+def launched(config: Config, run_dir: Path, on_message: OnMessage | None = None,
+             processes: Sequence[Process] = PROCESSES, say: Callable[[str], None] | None = None,
+             topics: Sequence[Topic] | None = None) -> Iterator[Ended]:
+    """Runs all episodes, one process per service, and gives their results in order, none where nobody judges; the log
+    is `run_dir`/run.mcap. A run ends when its source has finished and what it sent has been worked off. Who looks on
+    stays until the context is left.
 
     `on_message(topic, part, message)` sees every valid message once, on the caller's thread, of these topics or of all:
     what nobody looks at costs nothing. `say(text)` is told of services that died and were started again, and of
@@ -52,11 +70,11 @@ def launch(config: Config, run_dir: Path, on_message: OnMessage | None = None,
     wanted = topics if on_message else ()
     with running(config, run_dir, processes, wanted if wanted is None else {*wanted, *FOLLOWED}, say) as graph:
         results = follow(graph, processes, on_message)
-        graph.supervisor.stop()
+        graph.supervisor.stop(onlookers=False)
         _drain(graph.messages, on_message)
         for complaint in graph.supervisor.complaints():  # what went wrong beside the results, such as a full disk
             print(f"saccade: {complaint}", file=sys.stderr)
-    return results
+        yield Ended(results, graph.supervisor.runs)
 
 
 @dataclass(frozen=True)
@@ -96,7 +114,7 @@ def resolve(config: Config, processes: Sequence[Process] = PROCESSES) -> Config:
     """The configuration as the processes read it: objects named, a free port, who must be ready first."""
     names = config.scene.names or names_of(config.scene.objects)
     return config.with_values({"bus.endpoint": free_endpoint(config.bus.endpoint), "scene.names": list(names),
-                               "bus.wait_for": [process.name for process in processes[2:]]})
+                               "bus.wait_for": [process.name for process in processes[2:] if not process.onlooker]})
 
 
 def _prepare(run_dir: Path) -> None:
@@ -142,7 +160,7 @@ def _await_router(messages: Iterator, router: Process) -> None:
 
 
 def follow(graph: Graph, processes: Sequence[Process], on_message: OnMessage | None) -> list[Result]:
-    starting = {process.name for process in processes[1:]}
+    starting = {process.name for process in processes[1:] if not process.onlooker}
     course = _Course(processes[1].name, judged=JUDGE in starting)
     over_s, deadline_s = None, time.monotonic() + READY_S
     for item in graph.messages:

@@ -150,7 +150,7 @@ def live(wanted: Wanted, *, endpoint: str | None, run: Path | None) -> Live:
     if endpoint is not None and run is not None:
         raise SaccadeError("--endpoint and --run both name a bus: give one of them")
     if endpoint is None:
-        bus = bus_of(run) if run is not None else newest()
+        bus = bus_of(run or newest_run())
         endpoint = bus.endpoint
     else:
         bus = BusConfig()
@@ -166,15 +166,14 @@ def bus_of(run: Path) -> BusConfig:
     return bus
 
 
-def newest(runs: Path = RUNS) -> BusConfig:
-    """The bus of the newest run in a folder that answers."""
+def newest_run(runs: Path = RUNS) -> Path:
+    """The folder of the newest run whose bus answers."""
     with suppress(OSError):
         folders = sorted((path.stat().st_mtime_ns, path.parent) for path in runs.glob(f"*/{CONFIG_NAME}"))
         for _, folder in folders[:-NEWEST - 1:-1]:
             with suppress(SaccadeError):
-                bus = bus_of(folder)
-                if answers(bus.endpoint):
-                    return bus
+                if answers(bus_of(folder).endpoint):
+                    return folder
     raise SaccadeError(f"no run in {runs.absolute()} is on a bus now: give --endpoint, --run or --log")
 
 

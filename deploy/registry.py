@@ -18,6 +18,7 @@ from shared.topics import TRUTH
 Pair = tuple[Service, Core]
 
 ROUTER, RECORDER = "router", "recorder"
+VIEWER = Process("viewer", "services.viewer", onlooker=True)
 
 
 @dataclass(frozen=True)
@@ -92,14 +93,14 @@ def local_pairs(agent: str, config: Config, world: str = DEFAULT_WORLD) -> list[
     return [source, *agents, *judges]
 
 
-def agent_processes(agent: str, world: str = DEFAULT_WORLD) -> tuple[Process, ...]:
-    """The processes of a run on the bus, the router first and the source second. Raises SaccadeError for an agent that
-    has none of its own."""
+def agent_processes(agent: str, world: str = DEFAULT_WORLD, *, view: bool = False) -> tuple[Process, ...]:
+    """The processes of a run on the bus, the router first and the source second; with `view` the viewer last. Raises
+    SaccadeError for an agent that has none of its own."""
     chosen, place = agent_of(agent), world_of(world)
     if chosen.cores:
         raise SaccadeError(f"agent {agent!r} runs within one process only: add `--bus local`")
-    return tuple(Process(name, f"services.{name}")
-                 for name in (ROUTER, place.source, *chosen.services, *place.judges, RECORDER))
+    names = (ROUTER, place.source, *chosen.services, *place.judges, RECORDER)
+    return (*(Process(name, f"services.{name}") for name in names), *((VIEWER,) if view else ()))
 
 
 def weight_hashes(agent: str, config: Config) -> dict[str, str]:

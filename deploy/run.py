@@ -7,20 +7,21 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from rich.console import Console
 
 from deploy.display import Display
 from deploy.ending import ending
-from deploy.launch import launch
-from deploy.registry import DEFAULT_WORLD, agent_of, agent_processes, local_pairs, world_of
+from deploy.launch import launched
+from deploy.registry import DEFAULT_WORLD, VIEWER, agent_of, agent_processes, local_pairs, world_of
 from deploy.supervisor import CONFIG_NAME
 from services.camera.core import build as build_camera
 from services.camera.sources import absolute, webcam_number
 from services.recorder.core import LOG_NAME, describe
 from services.simulator.core import names_in_use
+from services.viewer.server import binary, url_of, with_free_ports
 from shared.config import Config
 from shared.errors import SaccadeError
 from shared.local import run_local
@@ -33,30 +34,48 @@ MANIFEST_NAME = "manifest.json"
 
 
 def run(config: Config, *, agent: str, out: Path | None, plain: bool, console: Console | None = None,
-        world: str = DEFAULT_WORLD) -> list[Result]:
+        world: str = DEFAULT_WORLD, view: bool = False) -> list[Result]:
     """Runs all episodes of a configuration into a new folder; prints how they ended and where it is. Ctrl-C is one of
-    the ends that the run of a real camera has."""
+    the ends that the run of a real camera has. With `view` the run can be looked at; on a terminal until Ctrl-C."""
     console, place = console or Console(), world_of(world)
     config = resolve(in_world(config, world))
     require_weights(agent, config)
-    processes = agent_processes(agent, world) if config.bus.kind == "zenoh" else ()
+    if view:
+        config = to_be_viewed(config)
+    processes = agent_processes(agent, world, view=view) if config.bus.kind == "zenoh" else ()
     folder = _new_folder(out or Path("runs") / f"{time.strftime('%Y%m%d-%H%M%S')}-{config.seed}")
     judged = not config.scene.explore and config.scene.goal_image is None
-    with Display(console, plain=plain, judged=judged, camera=place.source if place.live else None) as display:
-        try:
-            if processes:
-                results = launch(config, folder, display.take, processes, display.say, display.topics)
-            else:
-                results = run_here(config, agent, folder, display, world)
-        except KeyboardInterrupt:
-            if not place.live or display.progress.at is None:
-                raise
-            results = []
-    for text in ending(config, results, display.progress):
-        console.print(text, markup=False, highlight=False, soft_wrap=True)
-    _draw(folder)
-    console.print(f"log, configuration and picture are in {folder}", markup=False, highlight=False, soft_wrap=True)
+    with ExitStack() as stack:
+        with Display(console, plain=plain, judged=judged, camera=place.source if place.live else None) as display:
+            if view:
+                display.say(f"look at {url_of(config.viewer)}")
+            try:
+                if processes:
+                    ended = stack.enter_context(
+                        launched(config, folder, display.take, processes, display.say, display.topics))
+                    results = ended.results
+                else:
+                    results = run_here(config, agent, folder, display, world)
+            except KeyboardInterrupt:
+                if not place.live or display.progress.at is None:
+                    raise
+                results = []
+        _tell(config, results, display, folder, console)
+        if view and console.is_terminal:
+            from deploy.view import stay  # Rerun is loaded where it is wanted
+
+            console.print(f"to be seen at {url_of(config.viewer)} until Ctrl-C", highlight=False)
+            stay(lambda: ended.runs(VIEWER.name))
     return results
+
+
+def to_be_viewed(config: Config) -> Config:
+    """The configuration with the ports that its viewer will have. Raises SaccadeError where it can have none."""
+    if config.bus.kind != "zenoh":
+        raise SaccadeError("--view is for services on the bus: leave `--bus local` out, or look at the log with "
+                           "`saccade view`")
+    binary()
+    return with_free_ports(config)
 
 
 def in_world(config: Config, world: str) -> Config:
@@ -145,6 +164,13 @@ def _interrupted_between_messages() -> Iterator[Callable[[], None]]:
         yield raise_if_interrupted
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+def _tell(config: Config, results: list[Result], display: Display, folder: Path, console: Console) -> None:
+    for text in ending(config, results, display.progress):
+        console.print(text, markup=False, highlight=False, soft_wrap=True)
+    _draw(folder)
+    console.print(f"log, configuration and picture are in {folder}", markup=False, highlight=False, soft_wrap=True)
 
 
 def _new_folder(folder: Path) -> Path:

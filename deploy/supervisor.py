@@ -31,10 +31,12 @@ BACK_S = 6.0  # what a router's return takes the others
 
 @dataclass(frozen=True)
 class Process:
-    """One service's process: `python -m <module>`."""
+    """One service's process: `python -m <module>`. An `onlooker` is not needed: nobody waits for it, a run does not
+    fail with it, and it stays when the others are stopped."""
 
     name: str
     module: str
+    onlooker: bool = False
 
 
 class Supervisor:
@@ -107,11 +109,12 @@ class Supervisor:
                 self._children[name].kill()
                 self._children[name].wait()
 
-    def stop(self) -> None:
+    def stop(self, *, onlookers: bool = True) -> None:
         """Ends the services in the order of the data, so that each works off what the one before it has sent; the
-        router, which came first, last."""
+        router, which came first, last. Those that look on may stay."""
         self.stopped = True
-        router, others = [*self._children.values()][:1], [*self._children.values()][1:]
+        ended = [child for name, child in self._children.items() if onlookers or not self._processes[name].onlooker]
+        router, others = ended[:1], ended[1:]
         for child in others + router:
             try:
                 if child.poll() is None:
@@ -126,6 +129,10 @@ class Supervisor:
                     other.wait()
                 raise
 
+    def runs(self, name: str) -> bool:
+        """Whether a service's process is there."""
+        return name in self._children and self._children[name].poll() is None
+
     def complaints(self) -> list[str]:
         """Of the stopped services: who did not end well, and what it said last."""
         return [f"{name}: {self._last_line(name, child.returncode)}"
@@ -137,17 +144,26 @@ class Supervisor:
 
     def _start_again(self, name: str, code: int) -> None:
         reason, past, now_s = self._last_line(name, code), self._restarts[name], time.monotonic()
-        if code == EXIT_ERROR:
-            raise SaccadeError(f"{name}: {reason}")
         while past and now_s - past[0] > RESTARTS_S:
             past.popleft()
-        if len(past) >= RESTARTS:
-            raise SaccadeError(f"{name}: {reason}; it has died {len(past) + 1} times in {RESTARTS_S:.0f} s")
+        if code == EXIT_ERROR or len(past) >= RESTARTS:
+            died = "" if code == EXIT_ERROR else f"; it has died {len(past) + 1} times in {RESTARTS_S:.0f} s"
+            if not self._processes[name].onlooker:
+                raise SaccadeError(f"{name}: {reason}{died}")
+            self._say(f"on without the {name}: {reason}{died}")
+            self._forget(name)
+            return
         past.append(now_s)
         self.start(self._processes[name])
         self._say(f"{name} is started again: {reason}")
         if name == next(iter(self._processes)):
             self._heard_s = {other: now_s + BACK_S for other in self._heard_s}
+
+    def _forget(self, name: str) -> None:
+        for known in (self._children, self._processes, self._heard_s, self._restarts):
+            known.pop(name, None)
+        self._up.discard(name)
+        self._silent.discard(name)
 
     def _last_line(self, name: str, code: int) -> str:
         lines = self.log_path(name).read_text(errors="replace").strip().splitlines()

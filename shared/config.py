@@ -107,6 +107,17 @@ class PlannerConfig(Section):
     information_weight: float = Field(1.0, ge=0)
 
 
+class ViewerConfig(Section):
+    """Where browsers find the viewer, and what it may keep. The page is on `port`, its data on `data_port` (0: a free
+    one); `truth`: also what the simulator alone knows."""
+
+    address: str = "127.0.0.1"
+    port: int = Field(9090, ge=1, le=65535)
+    data_port: int = Field(0, ge=0, le=65535)
+    memory_mb: int = Field(1024, ge=16, le=1_000_000)
+    truth: bool = False
+
+
 class Config(Section):
     """A run. `run` is its name; where absent, that of its folder."""
 
@@ -119,6 +130,7 @@ class Config(Section):
     perception: PerceptionConfig = PerceptionConfig()
     belief: BeliefConfig = BeliefConfig()
     planner: PlannerConfig = PlannerConfig()
+    viewer: ViewerConfig = ViewerConfig()
 
     @property
     def weights(self) -> Path:

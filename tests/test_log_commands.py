@@ -166,7 +166,7 @@ def test_cuts_up_to_the_end_and_of_cuts(monkeypatch, capsys, run, tmp_path):
     (("info", "none"), "cannot be read"),
     (("check", "none"), "cannot be read"),
     (("recover", "none", "--out", "o.mcap"), "cannot be read"),
-    (("recover", "run", "--out", "run/run.mcap"), "is there already: give --out a new place"),
+    (("recover", "run", "--out", "run/run.mcap"), "is there already: name a new place"),
     (("cut", "run", "--out", "run/run.mcap"), "is there already"),
     (("cut", "run", "--out", "o.mcap", "--episode", 7), "has no episode 7: choose from 0 to 1"),
     (("cut", "run", "--out", "o.mcap", "--start", 9), "has the steps 0 to 6: none of from 9 on"),

@@ -69,7 +69,7 @@ def whole(out: Path) -> Iterator[Path]:
     """A path beside `out`, for a file or a folder, that becomes `out` when all is well and is removed when it is not.
     Raises SaccadeError if `out` is there already or cannot be written."""
     if out.exists():
-        raise SaccadeError(f"{out} is there already: give --out a new place")
+        raise SaccadeError(f"{out} is there already: name a new place")
     partial = out.with_name(f"{out.name}.part")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)

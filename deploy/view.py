@@ -1,0 +1,113 @@
+"""`saccade view`: a run in Rerun's viewer, while it goes on or from its log; or as a file for it."""
+
+from __future__ import annotations
+
+import json
+import time
+import webbrowser
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+
+import rerun as rr
+from rich.console import Console
+
+from deploy.listen import bus_of, newest_run, until_interrupted
+from deploy.logs.source import LOG_NAME, Log, log_of, whole
+from deploy.supervisor import CONFIG_NAME
+from services.viewer.core import Viewer
+from services.viewer.live import QUEUE_BYTES, watch
+from services.viewer.server import Server, with_free_ports
+from shared.bus import ZenohBus
+from shared.config import Config, load, validate
+from shared.errors import SaccadeError
+from shared.process import Health, Inbox
+from shared.topics import GOAL_PERCEPT
+
+POLL_S = 0.2
+
+
+def view_log(log: Path, *, save: Path | None, truth: bool, port: int | None, open_page: bool,
+             weights: Path | None, console: Console) -> None:
+    """Shows a log until Ctrl-C, or writes it as a file of Rerun's. Raises SaccadeError for what is no log."""
+    log = log_of(log)
+    recording = rr.RecordingStream("saccade", recording_id=log.parent.name if log.name == LOG_NAME else log.stem)
+    if save is not None:
+        with whole(save) as partial:
+            recording.save(partial)
+            _show(log, recording, truth, weights, console)
+            recording.disconnect()
+        _say(console, f"written to {save}: `rerun {save}` shows it")
+        return
+    with Server(_ports(Config(), port).viewer) as server:
+        recording.connect_grpc(server.data_url)
+        _say(console, f"{log} at {server.url} until Ctrl-C")
+        if open_page:
+            webbrowser.open(server.url)
+        _show(log, recording, truth, weights, console)
+        stay(lambda: server.running)
+
+
+def view_live(*, endpoint: str | None, run: Path | None, truth: bool, port: int | None, open_page: bool,
+              weights: Path | None, console: Console) -> None:
+    """Shows a run that goes on, from its start, until Ctrl-C. Raises SaccadeError where there is none."""
+    config = _ports(_with_weights(_of_run(endpoint, run), weights), port).with_values({"viewer.truth": truth})
+    inbox = Inbox(QUEUE_BYTES)
+    with closing(ZenohBus(config.bus.endpoint, world=config.bus.world)) as bus, Server(config.viewer) as server:
+        if not config.scene.names:
+            names = sorted({kept.part for kept in bus.recall((GOAL_PERCEPT,)) if kept.part})
+            config = config.with_values({"scene.names": names})
+        _say(console, f"{config.run or config.bus.endpoint} at {server.url} until Ctrl-C")
+        if open_page:
+            webbrowser.open(server.url)
+        with until_interrupted(inbox.stop):
+            lacks = watch(bus, server, config, inbox, Health("viewer", at=(config.run or "", 0, 0)))
+        _tell(lacks, console)
+
+
+def stay(running: Callable[[], bool]) -> None:
+    """Until Ctrl-C, or what is looked at has ended."""
+    try:
+        while running():
+            time.sleep(POLL_S)
+    except KeyboardInterrupt:
+        return
+
+
+def _ports(config: Config, port: int | None) -> Config:
+    return with_free_ports(config) if port is None else config.with_values({"viewer.port": port})
+
+
+def _with_weights(config: Config, weights: Path | None) -> Config:
+    return config if weights is None else config.with_values({"perception.weights": weights.resolve()})
+
+
+def _of_run(endpoint: str | None, run: Path | None) -> Config:
+    if endpoint is not None and run is not None:
+        raise SaccadeError("--endpoint and --run both name a bus: give one of them")
+    if endpoint is not None:
+        return Config().with_values({"bus.endpoint": endpoint})
+    folder = run or newest_run()
+    bus_of(folder)
+    return load(folder / CONFIG_NAME).with_values({"run": folder.resolve().name})
+
+
+def _show(path: Path, recording: rr.RecordingStream, truth: bool, weights: Path | None,
+          console: Console) -> None:
+    """Every message of a log; says what could not be shown."""
+    log, viewer = Log(path, console), None
+    for entry, message in log:
+        if viewer is None:  # the configuration stands before the first message
+            config = validate(json.loads(log.reader.configuration or "{}"), f"the log {path}")
+            viewer = Viewer(recording, _with_weights(config, weights), truth=truth, live=False)
+        viewer.take(entry.topic, entry.part, message)
+    _tell(viewer.close(), console)
+
+
+def _tell(lacks: list[str], console: Console) -> None:
+    for text in lacks:
+        _say(console, text)
+
+
+def _say(console: Console, text: str) -> None:
+    console.print(text, markup=False, highlight=False, soft_wrap=True)

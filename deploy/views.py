@@ -1,0 +1,61 @@
+"""`saccade view`, `film` and `picture`: commands that show a run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from shared.errors import SaccadeError
+
+app = typer.Typer()
+
+Log = Annotated[Path, typer.Argument(metavar="RUN", help="folder of a run, or its log")]
+
+
+@app.command()
+def view(*, log: Annotated[Path | None, typer.Argument(metavar="RUN", help="folder of a run, or its log")] = None,
+         live: Annotated[bool, typer.Option("--live", help="a run that goes on, instead of a log")] = False,
+         save: Annotated[Path | None, typer.Option(
+             help="write a recording for Rerun's own viewer instead", metavar="RUN.rrd")] = None,
+         truth: Annotated[bool, typer.Option(
+             "--truth", help="also what the simulator alone knows: the goal's camera, objects as ghosts")] = False,
+         port: Annotated[int | None, typer.Option(
+             min=1, max=65535, help="of the page [default: 9090 or the next that is free]")] = None,
+         open_page: Annotated[bool, typer.Option("--open", help="open it in this machine's browser")] = False,
+         run: Annotated[Path | None, typer.Option(
+             metavar="FOLDER", help="of a run that goes on [default: the newest in runs/ that answers]")] = None,
+         endpoint: Annotated[str | None, typer.Option(help="a bus instead, e.g. tcp/127.0.0.1:7447")] = None,
+         weights: Annotated[Path | None, typer.Option(
+             help="that draw crops and views [default: the run's own, or weights/pantry]")] = None) -> None:
+    """See it think: the table, beliefs, images and curves of a run in a browser; Ctrl-C ends it."""
+    from rich.console import Console
+
+    if live == (log is not None):
+        raise SaccadeError("give the log of a run, or --live for one that goes on")
+    if live and save is not None:
+        raise SaccadeError("--save is for a log: a run that goes on is being logged already")
+    if not live and (run is not None or endpoint is not None):
+        raise SaccadeError("--run and --endpoint are for a run that goes on: add --live, or leave them out")
+    from deploy.view import view_live, view_log
+
+    if live:
+        view_live(endpoint=endpoint, run=run, truth=truth, port=port, open_page=open_page, weights=weights,
+                  console=Console())
+    else:
+        view_log(log, save=save, truth=truth, port=port, open_page=open_page, weights=weights, console=Console())
+
+
+@app.command()
+def picture(log: Log,
+            out: Annotated[Path | None, typer.Option(help="file [default: picture.png beside the log]")] = None,
+            episode: Annotated[int | None, typer.Option(min=0, help="which one [default: the last]")] = None) -> None:
+    """Draw the picture of a run from its log once more."""
+    from deploy.picture import draw
+    from deploy.run import LOG_NAME, PICTURE_NAME
+
+    file = log / LOG_NAME if log.is_dir() else log
+    target = out or file.with_name(PICTURE_NAME)
+    draw(file, target, episode)
+    print(f"written to {target}")

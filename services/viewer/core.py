@@ -1,0 +1,157 @@
+"""The messages of a run as a Rerun recording: what the agent sees, believes and plans, step by step.
+
+Live and from a log it is the same code. The steps of several episodes follow one another on the timeline `step`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import rerun as rr
+
+from services.viewer.curves import Curves
+from services.viewer.images import Images
+from services.viewer.imagination import Imagination
+from services.viewer.layout import STEP, Colour, colour_of, layout
+from services.viewer.words import decision, ending
+from services.viewer.world import World
+from shared.config import Config
+from shared.errors import SaccadeError
+from shared.messages import Belief, Frame, Message, Percept, Plan, Result, Status, Truth
+from shared.stepper import settle
+from shared.topics import BELIEF, FRAME, GOAL, PERCEPT, PLAN, RESULT, STATUS, TRUTH, Topic
+from shared.weights import Weights
+
+SHOWN = (FRAME, GOAL, PERCEPT, BELIEF, PLAN, TRUTH, RESULT, STATUS)
+WITHOUT = {  # what is not there to be seen without a topic
+    FRAME: "the camera and what it sees", GOAL: "the goal", PERCEPT: "boxes, masks and crops",
+    BELIEF: "particles, beliefs, entropy and F", PLAN: "candidates, viewpoints, G and decisions",
+    TRUTH: "the true distance to the goal", STATUS: "milliseconds and messages dropped"}
+
+
+@dataclass
+class Step:
+    """What has come of one step."""
+
+    frame: Frame | None = None
+    percepts: dict[str, Percept] = field(default_factory=dict)
+    beliefs: dict[str, Belief] = field(default_factory=dict)
+
+
+class Viewer:
+    """Logs messages to a recording. `truth`: also what the simulator alone knows. `live`: while the run goes on.
+    `lacks`: what cannot be shown because something of ours is missing, in words."""
+
+    def __init__(self, recording: rr.RecordingStream, config: Config, *, truth: bool, live: bool) -> None:
+        self._to, self._truth, self._names = recording, truth, list(config.scene.names or ())
+        self.lacks: list[str] = []
+        recording.send_blueprint(layout(live=live, objects=len(self._names)))
+        recording.set_time(STEP, sequence=0)
+        weights, imagination = self._networks(config)
+        sizes_m = {card.name: card.size_m for card in weights.cards} if weights else {}
+        self._world = World(recording, self._colour_of, sizes_m)
+        self._images = Images(recording, tuple(self._names), self._colour_of, imagination)
+        self._curves = Curves(recording, self._colour_of)
+        self._show = {FRAME: self._frame, GOAL: self._images.goal, PERCEPT: self._percept, BELIEF: self._belief,
+                      PLAN: self._plan, TRUTH: self._true, RESULT: self._result, STATUS: self._status}
+        self._episode, self._first, self._newest = -1, 0, 0  # which one, where it begins on the timeline, its last step
+        self._step, self._believed = Step(), {}
+        self._said = ""
+        self._came: set[str] = set()
+
+    def take(self, topic: Topic, part: str | None, message: Message) -> None:
+        """Any message, in the order of arrival; what is not shown is passed over."""
+        if topic not in self._show:
+            return
+        self._came.add(topic.name)
+        if topic.in_step:
+            self._move_to(message.episode, message.step)
+        self._show[topic](settle(message))
+
+    def dropped(self, count: int) -> None:
+        """So many messages came faster than they could be shown."""
+        self._curves.dropped("viewer", count)
+
+    def close(self) -> list[str]:
+        """Shows what is left of the last step; what could not be shown, in words."""
+        self._finish()
+        lacks = [*self.lacks, *(f"no {topic.name}: without {what}" for topic, what in WITHOUT.items()
+                                if topic.name not in self._came)]
+        for text in lacks:
+            self._to.log("decisions", rr.TextLog(text, level=rr.TextLogLevel.WARN))
+        self._to.flush()
+        return lacks
+
+    def _networks(self, config: Config) -> tuple[Weights | None, Imagination | None]:
+        try:
+            weights = Weights(config.weights)
+            return weights, Imagination(weights, tuple(self._names)) if self._names else None
+        except SaccadeError as error:
+            self.lacks.append(f"without crops, reconstructions and imagined views: {error}")
+            return None, None
+
+    def _colour_of(self, name: str) -> Colour:
+        if name not in self._names:
+            self._names.append(name)
+        return colour_of(self._names.index(name))
+
+    def _move_to(self, episode: int, step: int) -> None:
+        if episode > self._episode:
+            self._finish()
+            self._first += self._newest + 1 if self._episode >= 0 else 0
+            self._episode, self._newest, self._believed, self._said = episode, 0, {}, ""
+            self._to.set_time(STEP, sequence=self._first)
+            self._world.begin()
+            self._images.begin()
+        if episode == self._episode:
+            if step > self._newest:
+                self._finish()
+                self._newest = step
+            self._to.set_time(STEP, sequence=self._first + step)
+
+    def _finish(self) -> None:
+        """What needs a step whole."""
+        step, self._step = self._step, Step()
+        if step.beliefs or step.percepts:
+            self._to.set_time(STEP, sequence=self._first + self._newest)
+        if step.beliefs:
+            self._curves.beliefs(step.beliefs.values())
+        if step.frame is not None:
+            self._images.step(step.frame, step.percepts)
+
+    def _frame(self, frame: Frame) -> None:
+        self._step.frame = frame
+        self._world.frame(frame)
+        self._images.frame(frame)
+
+    def _percept(self, percept: Percept) -> None:
+        self._step.percepts[percept.object] = percept
+        width = self._step.frame.rgb.shape[1] if self._step.frame else 480
+        self._images.percept(percept, width, percept.world_from_camera[2, :3])
+
+    def _belief(self, belief: Belief) -> None:
+        self._step.beliefs[belief.object] = self._believed[belief.object] = belief
+        self._world.belief(belief)
+
+    def _plan(self, plan: Plan) -> None:
+        self._world.plan(plan, self._images.planned_px)
+        self._images.plan(plan, self._believed)
+        self._curves.plan(plan)
+        self._say(decision(plan, self._believed.values()))
+
+    def _true(self, truth: Truth) -> None:
+        if self._truth:
+            self._world.truth(truth)
+            self._curves.truth(truth)
+
+    def _result(self, result: Result) -> None:
+        self._finish()
+        self._say(ending(result))
+
+    def _status(self, status: Status) -> None:
+        self._curves.status(status)
+
+    def _say(self, text: str) -> None:
+        if text != self._said:
+            self._said = text
+            self._to.log("decisions", rr.TextLog(text, level=rr.TextLogLevel.INFO))

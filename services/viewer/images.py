@@ -1,0 +1,114 @@
+"""What the camera sees and what the networks make of it, as images."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from services.viewer.imagination import Imagination
+from services.viewer.layout import CELL_PX, VIEW_PX, Colour
+from services.viewer.words import SEEN, plain
+from services.viewer.world import CAMERA, VIEWPOINT
+from shared.generative_model import CROP_PX
+from shared.messages import Belief, Frame, Goal, Percept, Plan
+
+CAMERA_IMAGE, GOAL_IMAGE, IMAGINED, CROPS = f"{CAMERA}/image", "goal/image", f"{VIEWPOINT}/imagined", "crops/image"
+OF_EPISODE = (CAMERA_IMAGE, GOAL_IMAGE, IMAGINED, CROPS)
+JPEG_QUALITY = 85
+DOT_PX = 12.0  # radius of what stands for a box where the size of the crop is not known
+UNSEEN = 0.25  # brightness of the crops of what is not there
+
+
+class Images:
+    """Logs images. Without an imagination there are no crops, no reconstructions and no planned view."""
+
+    def __init__(self, recording: rr.RecordingStream, names: tuple[str, ...], colour_of: Callable[[str], Colour],
+                 imagination: Imagination | None) -> None:
+        self._to, self._names, self._colour_of, self._imagination = recording, names, colour_of, imagination
+        self.begin()
+        if imagination:
+            places = [((k + 0.5) * CELL_PX, 2 * CELL_PX) for k in range(len(names))]
+            self._to.log("crops/names", rr.Points2D(places, labels=[plain(name) for name in names], radii=2.0,
+                                                    colors=[colour_of(name) for name in names], show_labels=True),
+                         static=True)
+
+    def begin(self) -> None:
+        """Another episode."""
+        self._seen: dict[str, Percept] = {}  # the last that saw the object
+        self._viewpoint: NDArray[np.float64] | None = None  # for which a view was imagined
+        for path in OF_EPISODE:
+            self._to.log(path, rr.Clear(recursive=True))
+
+    def goal(self, goal: Goal) -> None:
+        """The image to reach."""
+        if goal.rgb is not None:
+            self._image(GOAL_IMAGE, goal.rgb)
+
+    def frame(self, frame: Frame) -> None:
+        """What the camera sees."""
+        self._image(CAMERA_IMAGE, frame.rgb)
+
+    def percept(self, percept: Percept, width_px: int, up: NDArray[np.float64]) -> None:
+        """Box, mask, name and presence of an object in the image; `up` [3]: which way is up, in the camera's frame."""
+        path = f"{CAMERA_IMAGE}/{rr.escape_entity_path_part(percept.object)}"
+        if percept.presence < SEEN:
+            self._to.log(path, rr.Clear(recursive=True))
+            return
+        self._seen[percept.object] = percept
+        colour, label = self._colour_of(percept.object), f"{plain(percept.object)} {percept.presence:.2f}"
+        if self._imagination is None:
+            self._to.log(f"{path}/box", rr.Points2D([percept.pixel], radii=DOT_PX, colors=[colour], labels=[label],
+                                                    show_labels=True))
+        else:
+            corners = self._imagination.window([percept]).pixels_of(2, percept.intrinsics_px, up)[0]
+            middle, reach = corners.mean((0, 1)), 2.0  # from the centres of 2x2 cells to the corners
+            ring = middle + reach * (corners.reshape(4, 2)[[0, 1, 3, 2, 0]] - middle)
+            self._to.log(f"{path}/box", rr.LineStrips2D([ring], colors=[colour], labels=[label], show_labels=True))
+        mask = percept.mask()
+        if mask is not None and mask.any():
+            self._to.log(f"{path}/mask", rr.LineStrips2D(outline(mask) * (width_px / len(mask)), colors=[colour],
+                                                         radii=0.8, draw_order=20))
+
+    def step(self, frame: Frame, percepts: dict[str, Percept]) -> None:
+        """The crops of a step above what the networks make of them; of all objects, or none."""
+        ordered = [percepts[name] for name in self._names if name in percepts]
+        if self._imagination is None or not ordered:
+            return
+        columns = np.concatenate([self._imagination.crops(frame, ordered),
+                                  self._imagination.reconstructions(ordered)], axis=1)
+        canvas = np.zeros((2 * CELL_PX, len(self._names) * CELL_PX, 3), np.uint8)
+        for percept, column in zip(ordered, columns, strict=True):
+            left = self._names.index(percept.object) * CELL_PX
+            bright = column if percept.presence >= SEEN else (column * UNSEEN).astype(np.uint8)
+            canvas[:CROP_PX, left:left + CROP_PX] = bright[:CROP_PX]
+            canvas[CELL_PX:CELL_PX + CROP_PX, left:left + CROP_PX] = bright[CROP_PX:]
+        self._image(CROPS, canvas)
+
+    def plan(self, plan: Plan, beliefs: dict[str, Belief]) -> None:
+        """The view from the chosen viewpoint as imagined, whenever another one is chosen."""
+        if self._imagination is None or np.array_equal(plan.viewpoint, self._viewpoint):
+            return
+        self._viewpoint = plan.viewpoint
+        known = [belief for belief in beliefs.values() if belief.presence >= SEEN]
+        self._image(IMAGINED, self._imagination.planned_view(plan.viewpoint, known, self._seen))
+
+    @property
+    def planned_px(self) -> int:
+        """Side of the view that is imagined."""
+        return VIEW_PX
+
+    def _image(self, path: str, rgb: NDArray[np.uint8]) -> None:
+        self._to.log(path, rr.Image(rgb).compress(jpeg_quality=JPEG_QUALITY))
+
+
+def outline(mask: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """The edges between cells [M, M] within and without, as lines [N, 2, 2] of (column, row)."""
+    padded = np.pad(mask, 1)
+    row, column = np.nonzero(padded[1:, 1:-1] != padded[:-1, 1:-1])
+    flat = np.stack([np.stack([column, row], -1), np.stack([column + 1, row], -1)], axis=1)
+    row, column = np.nonzero(padded[1:-1, 1:] != padded[1:-1, :-1])
+    upright = np.stack([np.stack([column, row], -1), np.stack([column, row + 1], -1)], axis=1)
+    return np.concatenate([flat, upright]).astype(np.float64)

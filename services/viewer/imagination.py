@@ -1,0 +1,89 @@
+"""What the agent's networks draw: the crops they look at, what they make of them, and the view that is planned.
+
+The planned view is imagined object by object, as the generative model has it (paper, section 3.2): each object's latent
+pose is moved to where the camera would be, drawn, and put where its belief would appear.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from services.viewer.layout import VIEW_PX
+from shared.generative_model import CROP_PX, Stacked, decoder_of
+from shared.geometry import IMAGE_SIZE_PX, INTRINSICS_PX, REFERENCE_RANGE_M, project, spherical, wrap
+from shared.latent import LatentTransition
+from shared.messages import Belief, Frame, Percept
+from shared.weights import Weights
+from shared.windows import Window
+
+Image = NDArray[np.uint8]
+
+DARK = 24  # of 255: darker than this, a drawn crop is its black background
+
+
+class Imagination:
+    """The networks of a run's objects. Raises SaccadeError where an object has no weights, or others than it says."""
+
+    def __init__(self, weights: Weights, names: tuple[str, ...]) -> None:
+        self.cards = {card.name: card for card in weights.cards_of(names)}
+        self._decode = Stacked([weights.fill(decoder_of(weights.architecture), name, "ccn.decoder.") for name in names])
+        self._rows = {name: row for row, name in enumerate(names)}
+        self._transitions = {name: LatentTransition(weights, name) for name in names}
+
+    def window(self, percepts: list[Percept]) -> Window:
+        """Where these objects' crops lie."""
+        return Window(np.array([p.pixel for p in percepts]), np.array([p.scale for p in percepts]),
+                      np.array([self.cards[p.object].crop_side_m for p in percepts]))
+
+    def crops(self, frame: Frame, percepts: list[Percept]) -> Image:
+        """What the networks look at [K, 64, 64, 3]; black beyond the image."""
+        up = frame.world_from_camera[2, :3]
+        pixels = self.window(percepts).pixels_of(CROP_PX, frame.intrinsics_px, up)
+        column, row = np.floor(pixels).astype(np.int64).transpose(3, 0, 1, 2)
+        height, width = frame.rgb.shape[:2]
+        inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
+        return np.where(inside[..., None], frame.rgb[row.clip(0, height - 1), column.clip(0, width - 1)], np.uint8(0))
+
+    def reconstructions(self, percepts: list[Percept]) -> Image:
+        """What they make of it: the latent poses' means, drawn [K, 64, 64, 3]."""
+        return self._draw({p.object: p.latent_mean for p in percepts})
+
+    def planned_view(self, viewpoint: NDArray[np.float64], beliefs: list[Belief], seen: dict[str, Percept]) -> Image:
+        """How these objects would look from `viewpoint` [4, 4], by the percepts that saw them last; [240, 240, 3]."""
+        view = np.zeros((VIEW_PX, VIEW_PX, 3), np.uint8)
+        scale = VIEW_PX / IMAGE_SIZE_PX
+        intrinsics = np.array(INTRINSICS_PX) * scale
+        center, depth = project(np.array([b.mean_m for b in beliefs]).reshape(-1, 3), viewpoint, intrinsics)
+        order = [k for k in np.argsort(-depth) if depth[k] > 0 and beliefs[k].object in seen]  # the nearest last
+        crops = self._draw({beliefs[k].object: self._moved(viewpoint, beliefs[k], seen[beliefs[k].object])
+                            for k in order})
+        grid = np.stack(np.meshgrid(*[np.arange(VIEW_PX) + 0.5] * 2), axis=-1).reshape(-1, 2)
+        for k, crop in zip(order, crops, strict=True):
+            away = np.linalg.norm(beliefs[k].mean_m - viewpoint[:3, 3])
+            window = Window(center[k:k + 1], np.array([REFERENCE_RANGE_M / away]),
+                            np.array([self.cards[beliefs[k].object].crop_side_m]))
+            at = window.crop_of(grid, intrinsics, viewpoint[2, :3])[0]
+            inside = (np.abs(at) < 1).all(axis=1)  # what is nowhere is not inside
+            column, row = ((at[inside] + 1) / 2 * CROP_PX).astype(np.int64).T
+            drawn = crop[row, column]
+            rows = np.flatnonzero(inside)[drawn.max(axis=1) > DARK]
+            view.reshape(-1, 3)[rows] = drawn[drawn.max(axis=1) > DARK]
+        return view
+
+    def _moved(self, viewpoint: NDArray[np.float64], belief: Belief, seen: Percept) -> NDArray[np.float32]:
+        """The latent pose as seen from there."""
+        azimuth, elevation, _ = spherical(np.stack([seen.world_from_camera[:3, 3], viewpoint[:3, 3]]), belief.mean_m)
+        moved = np.array([[wrap(azimuth[1] - azimuth[0]), elevation[1] - elevation[0]]])
+        return self._transitions[belief.object](seen.latent_mean, moved)[0][0]
+
+    @torch.inference_mode()
+    def _draw(self, latents: dict[str, NDArray[np.float32]]) -> Image:
+        if not latents:
+            return np.zeros((0, CROP_PX, CROP_PX, 3), np.uint8)
+        every = torch.zeros(len(self._rows), 1, len(next(iter(latents.values()))))
+        rows = [self._rows[name] for name in latents]
+        every[rows, 0] = torch.from_numpy(np.stack(list(latents.values())))
+        drawn = self._decode(every)[rows, 0].clamp(0, 1).permute(0, 2, 3, 1).numpy()
+        return (drawn * 255 + 0.5).astype(np.uint8)

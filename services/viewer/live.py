@@ -1,0 +1,85 @@
+"""The viewer on the bus: an onlooker. Nobody waits for it, and what it cannot keep up with it leaves out."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from contextlib import closing, suppress
+from pathlib import Path
+
+import rerun as rr
+
+from services.viewer.core import SHOWN, Viewer
+from services.viewer.server import Server
+from shared.bus import Bus, ZenohBus
+from shared.config import Config
+from shared.errors import SaccadeError
+from shared.outbox import KEPT_BYTES
+from shared.process import Health, Heartbeat, Inbox, run_process
+from shared.sequences import Sequences
+from shared.topics import STATUS, Topic
+from shared.wire import MessageError, decode
+
+NAME = "viewer"
+QUEUE_BYTES = 64 * 1024 * 1024  # of messages that wait to be shown; what does not fit is dropped and counted
+TICK_S = 0.5
+NICE = 5  # where processors are short, the agent comes first
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """The viewer's process."""
+    run_process(NAME, _work, inbox=Inbox(QUEUE_BYTES), argv=argv)
+
+
+def _work(config: Config, folder: Path, inbox: Inbox) -> None:
+    os.nice(NICE)
+    health = Health(NAME, at=(config.run or folder.name, 0, 0))
+    with (Server(config.viewer) as server, closing(ZenohBus(config.bus.endpoint, world=config.bus.world)) as bus,
+          Heartbeat(bus, health, inbox.stop)):
+        watch(bus, server, config, inbox, health)
+
+
+def watch(bus: Bus, server: Server, config: Config, inbox: Inbox, health: Health) -> list[str]:
+    """Shows a run from its start, as far as its services still know it, until the inbox is stopped; what could not be
+    shown, in words. `health` counts, and names the run, or not: then it is the one that goes on. Raises SaccadeError if
+    the server ends."""
+    bus.subscribe(SHOWN, inbox.put)
+    run = health.at[0]
+    past = bus.recall([topic for topic in SHOWN if topic != STATUS], (run, 0, 0) if run else None, KEPT_BYTES)
+    recording = rr.RecordingStream("saccade", recording_id=run or (past[0].at[0] if past else None))
+    recording.connect_grpc(server.data_url)
+    feed = _Feed(Viewer(recording, config, truth=config.viewer.truth, live=True), health)
+    health.say(state="ready", note=server.url)
+    for kept in sorted(past, key=lambda kept: kept.published_ns):
+        feed.take(kept.topic, kept.part, kept.payload)
+    for item in inbox.items(tick_s=TICK_S):
+        if not server.running:
+            raise SaccadeError("viewer: Rerun's server has ended")
+        if item is not None:
+            feed.take(*item)
+        feed.note_dropped(inbox.dropped)
+    lacks = feed.viewer.close()
+    recording.disconnect()
+    return lacks
+
+
+class _Feed:
+    """Each message once, the valid ones."""
+
+    def __init__(self, viewer: Viewer, health: Health) -> None:
+        self.viewer, self._health = viewer, health
+        self._sequences = Sequences()
+
+    def take(self, topic: Topic, part: str | None, payload: bytes) -> None:
+        self._health.received += 1
+        with suppress(MessageError):  # whoever works with it counts it
+            message = decode(topic.type, payload)
+            if self._sequences.take(topic, part, message) is not None:
+                self.viewer.take(topic, part, message)
+                self._health.at = (message.run, message.episode, message.step)
+
+    def note_dropped(self, count: int) -> None:
+        """So many came while the inbox was full."""
+        if count > self._health.skipped:
+            self._health.skipped = count
+            self.viewer.dropped(count)

@@ -1,0 +1,154 @@
+"""Rerun's server with its web viewer: keeps what was logged for browsers that come later, within a bound.
+
+Two ports: the page, which comes through a door of ours, and the data. Rerun's usage analytics are off.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
+from types import TracebackType
+
+from services.viewer.door import open_door
+from shared.config import Config, ViewerConfig
+from shared.errors import SaccadeError
+
+LOOPBACK = "127.0.0.1"
+START_S, STOP_S = 20.0, 5.0
+PORTS = 100  # that are tried, from the wished one on
+PR_SET_PDEATHSIG = 1
+
+
+class Server:
+    """Rerun's server as a child process, and the door before its page, at `url`. Raises SaccadeError where it cannot be
+    started: Rerun is not installed, a port is taken."""
+
+    def __init__(self, config: ViewerConfig) -> None:
+        self._home = tempfile.TemporaryDirectory(prefix="saccade-viewer-", ignore_cleanup_errors=True)
+        self.data_port = config.data_port or free_port(config.address)
+        self.address, self.url = config.address, url_of(config)
+        pages = free_port(config.address)
+        self._door = open_door(config, here(config.address), pages, self.data_port)
+        self._child = self._start(pages, config.memory_mb)
+        threading.Thread(target=self._door.serve_forever, name="door", daemon=True).start()
+
+    @property
+    def data_url(self) -> str:
+        """Where a recording is logged to."""
+        return f"rerun+http://{here(self.address)}:{self.data_port}/proxy"
+
+    @property
+    def running(self) -> bool:
+        """Whether the child still runs."""
+        return self._child.poll() is None
+
+    def __enter__(self) -> Server:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 trace: TracebackType | None) -> None:
+        self._door.shutdown()
+        self._door.server_close()
+        self._child.terminate()
+        try:
+            self._child.wait(STOP_S)
+        except subprocess.TimeoutExpired:
+            self._child.kill()
+            self._child.wait()
+        self._home.cleanup()
+
+    def _start(self, pages: int, memory_mb: int) -> subprocess.Popen:
+        log = Path(self._home.name) / "log"
+        command = [binary(), "--serve-web", "--bind", self.address, "--port", str(self.data_port), "--web-viewer-port",
+                   str(pages), "--server-memory-limit", f"{memory_mb}MB"]
+        if self.address != LOOPBACK:
+            command += ["--cors-allow-origin", f"http://*:{self.port}"]
+        with log.open("wb") as out:
+            child = subprocess.Popen(command, env=self._environment(), stdin=subprocess.DEVNULL, stdout=out,
+                                     stderr=subprocess.STDOUT, start_new_session=True, preexec_fn=_end_with_parent())
+        end_s = time.monotonic() + START_S
+        while not (listens(self.address, self.data_port) and listens(self.address, pages)):
+            if child.poll() is not None or time.monotonic() > end_s:
+                child.kill()
+                self._door.server_close()
+                said = [line for line in log.read_text(errors="replace").splitlines() if line.strip()] or ["nothing"]
+                raise SaccadeError(f"viewer: Rerun's server does not start on port {self.data_port}: it said "
+                                   f"{said[-1][-300:]!r}")
+            time.sleep(0.05)
+        return child
+
+    def _environment(self) -> dict[str, str]:
+        """A home of its own, in which analytics are off."""
+        config = Path(self._home.name) / ".config" / "rerun" / "analytics.json"
+        config.parent.mkdir(parents=True)
+        config.write_text(json.dumps({"analytics_enabled": False, "analytics_id": "", "metadata": {}}))
+        kept = {name: value for name, value in os.environ.items() if not name.startswith("XDG_")}
+        return {**kept, "HOME": self._home.name, "RUST_LOG": "warn", "NO_COLOR": "1"}
+
+
+def url_of(config: ViewerConfig) -> str:
+    """What a person types."""
+    return f"http://{'localhost' if config.address in ('0.0.0.0', '::') else config.address}:{config.port}"
+
+
+def with_free_ports(config: Config) -> Config:
+    """The configuration with the ports that a viewer will have: its own, or the next that is free. Raises SaccadeError
+    where none is."""
+    viewer = config.viewer
+    return config.with_values({"viewer.port": free_port(viewer.address, viewer.port),
+                               "viewer.data_port": viewer.data_port or free_port(viewer.address)})
+
+
+def binary() -> str:
+    """Rerun's program. Raises SaccadeError where it is not installed."""
+    spec = find_spec("rerun_cli")
+    path = Path(spec.origin).parent / ("rerun.exe" if sys.platform == "win32" else "rerun") if spec else None
+    if path is None or not path.is_file():
+        raise SaccadeError("viewer: Rerun is not installed: pip install 'saccade[viewer]'")
+    return str(path)
+
+
+def free_port(address: str, first: int | None = None) -> int:
+    """A port that is free now; with `first` that one, or the next after it. Raises SaccadeError where there is none."""
+    for port in [0] if first is None else range(first, min(first + PORTS, 65536)):
+        try:
+            with socket.socket(socket.AF_INET6 if ":" in address else socket.AF_INET) as probe:
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                probe.bind((address, port))
+                return probe.getsockname()[1]
+        except OSError as error:
+            reason = error.strerror or str(error)
+    raise SaccadeError(f"viewer: no port from {first or 0} on is free at {address}: {reason}")
+
+
+def here(address: str) -> str:
+    """The address by which this machine reaches what is bound to `address`."""
+    return {"0.0.0.0": LOOPBACK, "::": "::1"}.get(address, address)
+
+
+def listens(address: str, port: int) -> bool:
+    """Whether somebody listens there."""
+    try:
+        with socket.create_connection((here(address), port), timeout=1.0):
+            return True
+    except OSError:
+        return False
+
+
+def _end_with_parent() -> Callable[[], None] | None:
+    """On Linux: a parent that is killed takes the server with it, and its ports are free again."""
+    if sys.platform != "linux":
+        return None
+    prctl = ctypes.CDLL(None).prctl
+    return lambda: prctl(PR_SET_PDEATHSIG, signal.SIGKILL)

@@ -1,0 +1,103 @@
+"""The table in three dimensions: camera and path, particles and beliefs, candidates, the chosen viewpoint, ghosts."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+
+import numpy as np
+import rerun as rr
+from numpy.typing import ArrayLike, NDArray
+
+from services.viewer.layout import PATH, PLANNED, TABLE, TRUE, Colour, between
+from services.viewer.words import SEEN, plain
+from shared.geometry import IMAGE_SIZE_PX, INTRINSICS_PX
+from shared.messages import Belief, Frame, Plan, Truth
+from shared.task import LOWER_M, UPPER_M
+
+CAMERA, VIEWPOINT, GOAL, TRUTH = "world/camera", "world/viewpoint", "world/goal", "world/true"
+OF_EPISODE = ("world/objects", "world/path", "world/candidates", VIEWPOINT, GOAL, TRUTH)  # cleared with the next
+FRUSTUM_M, PLANNED_M, GHOST_M = 0.10, 0.07, 0.04
+PATH_LENGTH = 500  # positions: what is drawn anew at every step must not grow with the run
+CHI_95 = 2.80  # a Gaussian in space is within so many deviations with probability 0.95
+PARTICLE_M, CANDIDATE_M = 0.0025, 0.006
+UNSEEN_GREY = 110  # towards which the particles of what is believed absent fade
+
+
+class World:
+    """Logs to `world/`. `colour_of(name)`: an object's; `sizes_m`: boxes of the objects [3], as far as they are
+    known."""
+
+    def __init__(self, recording: rr.RecordingStream, colour_of: Callable[[str], Colour],
+                 sizes_m: dict[str, NDArray[np.float64]]) -> None:
+        self._to, self._colour_of, self._sizes_m = recording, colour_of, sizes_m
+        self._path: deque[NDArray[np.float64]] = deque(maxlen=PATH_LENGTH)
+        self._to.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        side = (UPPER_M - LOWER_M)[:2]
+        self._to.log("world/table", rr.Boxes3D(centers=[(0, 0, -0.006)], sizes=[(*side, 0.01)], colors=[TABLE],
+                                               fill_mode="solid"), static=True)
+
+    def begin(self) -> None:
+        """Another episode: nothing is there yet."""
+        self._path.clear()
+        for path in OF_EPISODE:
+            self._to.log(path, rr.Clear(recursive=True))
+
+    def frame(self, frame: Frame) -> None:
+        """Where the camera is, and has been."""
+        height, width = frame.rgb.shape[:2]
+        self._camera(CAMERA, frame.world_from_camera, frame.intrinsics_px, (width, height), FRUSTUM_M, PATH)
+        self._path.append(frame.world_from_camera[:3, 3])
+        self._to.log("world/path", rr.LineStrips3D([np.array(self._path)], colors=[PATH], radii=[0.0015]))
+
+    def belief(self, belief: Belief) -> None:
+        """Particles; within the ellipsoid the object is with probability 0.95."""
+        path, colour = f"world/objects/{rr.escape_entity_path_part(belief.object)}", self._colour_of(belief.object)
+        faded = [round(UNSEEN_GREY + (part - UNSEEN_GREY) * (0.2 + 0.8 * belief.presence)) for part in colour]
+        self._to.log(f"{path}/particles", rr.Points3D(belief.particles_m, colors=[faded], radii=PARTICLE_M))
+        if belief.presence < SEEN:
+            self._to.log(f"{path}/belief", rr.Clear(recursive=False))
+            return
+        values, vectors = np.linalg.eigh(belief.covariance_m2)
+        vectors[:, 0] *= np.sign(np.linalg.det(vectors))
+        self._to.log(f"{path}/belief", rr.Ellipsoids3D(
+            centers=[belief.mean_m], half_sizes=[CHI_95 * np.sqrt(np.maximum(values, 1e-8))],
+            quaternions=[rr.Quaternion(xyzw=quaternion(vectors))], colors=[colour], labels=[plain(belief.object)],
+            show_labels=True))
+
+    def plan(self, plan: Plan, size_px: int) -> None:
+        """The best candidates, the best one green, and the chosen viewpoint. `size_px`: side of the image that is
+        imagined there."""
+        scale = size_px / IMAGE_SIZE_PX
+        self._camera(VIEWPOINT, plan.viewpoint, np.array(INTRINSICS_PX) * scale, (size_px, size_px), PLANNED_M, PLANNED)
+        if plan.best_eyes_m is not None:
+            above = plan.best_g - plan.best_g.min()
+            shares = above / max(float(above.max()), 1e-6)
+            self._to.log("world/candidates", rr.Points3D(
+                plan.best_eyes_m, colors=[between(float(share)) for share in shares], radii=CANDIDATE_M))
+
+    def truth(self, truth: Truth) -> None:
+        """What the simulator alone knows: the goal's camera, and the objects as ghosts."""
+        self._camera(GOAL, truth.goal_world_from_camera, INTRINSICS_PX, (IMAGE_SIZE_PX,) * 2, FRUSTUM_M, TRUE)
+        half = np.zeros((len(truth.names), 3)) + GHOST_M
+        for k, name in enumerate(truth.names):
+            half[k] = self._sizes_m.get(name, 2 * half[k]) / 2
+        turned = [rr.Quaternion(xyzw=(0, 0, np.sin(yaw / 2), np.cos(yaw / 2))) for yaw in truth.yaws_rad]
+        self._to.log(TRUTH, rr.Boxes3D(
+            centers=truth.centers_m, half_sizes=half, quaternions=turned, labels=[plain(name) for name in truth.names],
+            colors=[(*self._colour_of(name), 70) for name in truth.names], fill_mode="solid", show_labels=False))
+
+    def _camera(self, path: str, world_from_camera: NDArray[np.float64], intrinsics_px: ArrayLike,
+                size_px: tuple[int, int], distance_m: float, colour: Colour) -> None:
+        fx, fy, cx, cy = np.asarray(intrinsics_px)
+        self._to.log(path, rr.Transform3D(translation=world_from_camera[:3, 3], mat3x3=world_from_camera[:3, :3]),
+                     rr.Pinhole(focal_length=(fx, fy), principal_point=(cx, cy), resolution=size_px, color=colour,
+                                camera_xyz=rr.ViewCoordinates.RUB, image_plane_distance=distance_m))
+
+
+def quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Of a rotation matrix [3, 3], as (x, y, z, w): the leading eigenvector of Bar-Itzhack's matrix (2000)."""
+    (a, b, c), (d, e, f), (g, h, i) = rotation
+    k = np.array([[a - e - i, d + b, g + c, h - f], [d + b, e - a - i, h + f, c - g],
+                  [g + c, h + f, i - a - e, d - b], [h - f, c - g, d - b, a + e + i]]) / 3
+    return np.linalg.eigh(k)[1][:, -1]
