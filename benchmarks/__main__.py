@@ -24,10 +24,11 @@ from services.perception.seen import Seen
 from services.planner.free_energy import expected_free_energy
 from services.planner.goal import Preference
 from shared.config import REPOSITORY
-from shared.generative_model import CROP_PX, Encoder, Stacked
+from shared.generative_model import Encoder, Stacked
 from shared.geometry import GRID_AZIMUTHS, GRID_ELEVATIONS, IMAGE_SIZE_PX, INTRINSICS_PX
 from shared.messages import Belief, Frame
 from shared.weights import Weights
+from shared.windows import CROP_PX
 from shared.wire import decode, encode
 
 

@@ -16,7 +16,7 @@ from deploy.listen import bus_of, newest_run, until_interrupted
 from deploy.logs.source import LOG_NAME, Log, log_of, whole
 from deploy.supervisor import CONFIG_NAME
 from services.viewer.core import Viewer
-from services.viewer.live import QUEUE_BYTES, watch
+from services.viewer.live import QUEUE_BYTES, step_back, watch
 from services.viewer.server import Server, with_free_ports
 from shared.bus import ZenohBus
 from shared.config import Config, load, validate
@@ -51,6 +51,7 @@ def view_log(log: Path, *, save: Path | None, truth: bool, port: int | None, ope
 def view_live(*, endpoint: str | None, run: Path | None, truth: bool, port: int | None, open_page: bool,
               weights: Path | None, console: Console) -> None:
     """Shows a run that goes on, from its start, until Ctrl-C. Raises SaccadeError where there is none."""
+    step_back()
     config = _ports(_with_weights(_of_run(endpoint, run), weights), port).with_values({"viewer.truth": truth})
     inbox = Inbox(QUEUE_BYTES)
     with closing(ZenohBus(config.bus.endpoint, world=config.bus.world)) as bus, Server(config.viewer) as server:

@@ -19,7 +19,7 @@ from shared.latent import MIN_STD
 from shared.weights import Architecture
 
 LATENT = 8
-CROP_PX = 64
+
 
 
 def conv_stack(channels_in: int, width: int) -> nn.Sequential:

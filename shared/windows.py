@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from shared.geometry import REFERENCE_RANGE_M, Array, pixel_rays, unit
 
+CROP_PX = 64  # side of a crop
 AHEAD = 1e-3  # cosine-like limit below which a ray does not meet the image plane
 NOWHERE_PX = -1e4
 

@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from services.simulator.views import ObjectViews
-from shared.generative_model import CROP_PX
+from shared.windows import CROP_PX
 from training.strangers import strangers
 
 REFERENCE_SHELL = 2  # index of the paper's 0.40 m among the shells

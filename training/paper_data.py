@@ -12,7 +12,7 @@ from torch import Tensor
 
 from services.perception.paper import CANVAS_PX, CROP_SIDE_M
 from services.simulator.views import TILE_PX, ObjectViews
-from shared.generative_model import CROP_PX
+from shared.windows import CROP_PX
 from training.crops import REFERENCE_SHELL, warp
 from training.frames import FrameBatch
 

@@ -13,9 +13,10 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
 from services.perception.seen import Seen, bits
-from shared.generative_model import CROP_PX, Stacked, conv_stack, decoder_of, encoder_of
+from shared.generative_model import Stacked, conv_stack, decoder_of, encoder_of
 from shared.geometry import IMAGE_SIZE_PX, INTRINSICS_PX, REFERENCE_RANGE_M
 from shared.weights import Weights
+from shared.windows import CROP_PX
 
 MASK_PX, WHERE_PX = 64, 32  # sides of what the mask network and the spatial transformer network see
 CANVAS_PX = 120  # images at least this large are cut with several samples per crop pixel

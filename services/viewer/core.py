@@ -51,7 +51,7 @@ class Viewer:
         sizes_m = {card.name: card.size_m for card in weights.cards} if weights else {}
         self._world = World(recording, self._colour_of, sizes_m)
         self._images = Images(recording, tuple(self._names), self._colour_of, imagination)
-        self._curves = Curves(recording, self._colour_of)
+        self._curves = Curves(recording, tuple(self._names), self._colour_of)
         self._show = {FRAME: self._frame, GOAL: self._images.goal, PERCEPT: self._percept, BELIEF: self._belief,
                       PLAN: self._plan, TRUTH: self._true, RESULT: self._result, STATUS: self._status}
         self._episode, self._first, self._newest = -1, 0, 0  # which one, where it begins on the timeline, its last step
@@ -115,7 +115,7 @@ class Viewer:
         if step.beliefs or step.percepts:
             self._to.set_time(STEP, sequence=self._first + self._newest)
         if step.beliefs:
-            self._curves.beliefs(step.beliefs.values())
+            self._curves.beliefs(step.beliefs)
         if step.frame is not None:
             self._images.step(step.frame, step.percepts)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import rerun as rr
@@ -10,63 +10,61 @@ import rerun as rr
 from services.viewer.layout import Colour
 from shared.messages import Belief, Plan, Status, Truth
 
-F_TERMS = ("pose", "identity", "crop", "position", "likelihood")
-G_TERMS = ("position", "scale", "pose", "information")
-TOTAL: Colour = (230, 230, 230)
+F_TERMS: dict[str, Colour] = {"total": (230, 230, 230), "pose": (86, 156, 214), "identity": (78, 201, 176),
+                              "crop": (181, 137, 0), "position": (106, 90, 205), "likelihood": (206, 120, 80)}
+G_TERMS: dict[str, Colour] = {"total": (230, 230, 230), "position": (106, 90, 205), "scale": (78, 201, 176),
+                              "pose": (86, 156, 214), "information": (206, 120, 80)}
+DISTANCES: dict[str, Colour] = {"believed": (255, 200, 0), "true": (230, 30, 230)}
 SMALLEST_M2 = 1e-8  # variance below which nothing is known more exactly
 
 
 class Curves:
-    """Logs scalars; the series of an object has the object's colour."""
+    """Logs scalars: several series to an entity, as each entity costs whoever draws it."""
 
-    def __init__(self, recording: rr.RecordingStream, colour_of: Callable[[str], Colour]) -> None:
-        self._to, self._colour_of = recording, colour_of
-        self._styled: set[str] = set()
-        for origin in ("F", "G"):
-            self._to.log(f"{origin}/total", rr.SeriesLines(colors=[TOTAL], widths=[2.5], names="total"), static=True)
+    def __init__(self, recording: rr.RecordingStream, names: Sequence[str],
+                 colour_of: Callable[[str], Colour]) -> None:
+        self._to, self._names, self._dropped = recording, tuple(names), {}
+        objects = {name: colour_of(name) for name in names}
+        for path, series in {"F": F_TERMS, "G": G_TERMS, "entropy": objects, "presence": objects}.items():
+            widths = [2.5 if name == "total" else 1.5 for name in series]
+            self._to.log(path, rr.SeriesLines(names=list(series), colors=list(series.values()), widths=widths),
+                         static=True)
+        for name, colour in DISTANCES.items():
+            self._to.log(f"distance/{name}", rr.SeriesLines(names=name, colors=colour), static=True)
 
-    def beliefs(self, beliefs: Iterable[Belief]) -> None:
+    def beliefs(self, beliefs: dict[str, Belief]) -> None:
         """Of all objects at one step: entropy and presence of each, the terms of F of all."""
-        beliefs = list(beliefs)
-        for belief in beliefs:
-            self._of_object("entropy", belief.object, entropy_nats(belief))
-            self._of_object("presence", belief.object, belief.presence)
-        for term in F_TERMS:
-            self._number(f"F/{term}", sum(getattr(belief, f"f_{term}") for belief in beliefs))
-        self._number("F/total", sum(belief.free_energy for belief in beliefs))
+        known = [beliefs.get(name) for name in self._names]
+        self._numbers("entropy", [np.nan if belief is None else entropy_nats(belief) for belief in known])
+        self._numbers("presence", [np.nan if belief is None else belief.presence for belief in known])
+        self._numbers("F", [sum(belief.free_energy if term == "total" else getattr(belief, f"f_{term}")
+                                for belief in beliefs.values()) for term in F_TERMS])
 
     def plan(self, plan: Plan) -> None:
         """The terms of G of the chosen viewpoint, and how far the goal is believed to be."""
-        for term in G_TERMS:
-            self._number(f"G/{term}", getattr(plan, f"g_{term}"))
-        self._number("G/total", plan.g)
+        self._numbers("G", [plan.g if term == "total" else getattr(plan, f"g_{term}") for term in G_TERMS])
         if plan.believed_distance_m >= 0:
-            self._number("distance/believed", plan.believed_distance_m)
+            self._numbers("distance/believed", [plan.believed_distance_m])
 
     def truth(self, truth: Truth) -> None:
         """How far the goal is."""
         apart = (truth.world_from_camera - truth.goal_world_from_camera)[:3, 3]
-        self._number("distance/true", float(np.linalg.norm(apart)))
+        self._numbers("distance/true", [float(np.linalg.norm(apart))])
 
     def status(self, status: Status) -> None:
         """What a service's last step took, and what it did not get or left out."""
         if status.milliseconds > 0:
-            self._number(f"milliseconds/{status.service}", status.milliseconds)
+            self._numbers(f"milliseconds/{status.service}", [status.milliseconds])
         self.dropped(status.service, status.skipped + status.gaps)
 
     def dropped(self, service: str, count: int) -> None:
         """Messages that a service has not taken so far."""
-        self._number(f"dropped/{service}", count)
+        if self._dropped.get(service) != count:
+            self._dropped[service] = count
+            self._numbers(f"dropped/{service}", [count])
 
-    def _of_object(self, what: str, name: str, value: float) -> None:
-        path = f"{what}/{rr.escape_entity_path_part(name)}"
-        if path not in self._styled:
-            self._styled.add(path)
-            self._to.log(path, rr.SeriesLines(colors=[self._colour_of(name)], names=name), static=True)
-        self._number(path, value)
-
-    def _number(self, path: str, value: float) -> None:
-        self._to.log(path, rr.Scalars(float(value)))
+    def _numbers(self, path: str, values: Sequence[float]) -> None:
+        self._to.log(path, rr.Scalars(values))
 
 
 def entropy_nats(belief: Belief) -> float:

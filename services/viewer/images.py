@@ -12,14 +12,13 @@ from services.viewer.imagination import Imagination
 from services.viewer.layout import CELL_PX, VIEW_PX, Colour
 from services.viewer.words import SEEN, plain
 from services.viewer.world import CAMERA, VIEWPOINT
-from shared.generative_model import CROP_PX
 from shared.messages import Belief, Frame, Goal, Percept, Plan
+from shared.windows import CROP_PX
 
 CAMERA_IMAGE, GOAL_IMAGE, IMAGINED, CROPS = f"{CAMERA}/image", "goal/image", f"{VIEWPOINT}/imagined", "crops/image"
 OF_EPISODE = (CAMERA_IMAGE, GOAL_IMAGE, IMAGINED, CROPS)
 JPEG_QUALITY = 85
 DOT_PX = 12.0  # radius of what stands for a box where the size of the crop is not known
-UNSEEN = 0.25  # brightness of the crops of what is not there
 
 
 class Images:
@@ -73,18 +72,17 @@ class Images:
                                                          radii=0.8, draw_order=20))
 
     def step(self, frame: Frame, percepts: dict[str, Percept]) -> None:
-        """The crops of a step above what the networks make of them; of all objects, or none."""
-        ordered = [percepts[name] for name in self._names if name in percepts]
-        if self._imagination is None or not ordered:
+        """The crops of the objects that a step shows, above what their networks make of them."""
+        ordered = [percepts[name] for name in self._names if name in percepts and percepts[name].presence >= SEEN]
+        if self._imagination is None:
             return
         columns = np.concatenate([self._imagination.crops(frame, ordered),
-                                  self._imagination.reconstructions(ordered)], axis=1)
+                                  self._imagination.reconstructions(ordered)], axis=1) if ordered else ()
         canvas = np.zeros((2 * CELL_PX, len(self._names) * CELL_PX, 3), np.uint8)
         for percept, column in zip(ordered, columns, strict=True):
             left = self._names.index(percept.object) * CELL_PX
-            bright = column if percept.presence >= SEEN else (column * UNSEEN).astype(np.uint8)
-            canvas[:CROP_PX, left:left + CROP_PX] = bright[:CROP_PX]
-            canvas[CELL_PX:CELL_PX + CROP_PX, left:left + CROP_PX] = bright[CROP_PX:]
+            canvas[:CROP_PX, left:left + CROP_PX] = column[:CROP_PX]
+            canvas[CELL_PX:CELL_PX + CROP_PX, left:left + CROP_PX] = column[CROP_PX:]
         self._image(CROPS, canvas)
 
     def plan(self, plan: Plan, beliefs: dict[str, Belief]) -> None:

@@ -7,16 +7,15 @@ pose is moved to where the camera would be, drawn, and put where its belief woul
 from __future__ import annotations
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from services.viewer.layout import VIEW_PX
-from shared.generative_model import CROP_PX, Stacked, decoder_of
+from shared.drawing import LatentDecoder
 from shared.geometry import IMAGE_SIZE_PX, INTRINSICS_PX, REFERENCE_RANGE_M, project, spherical, wrap
 from shared.latent import LatentTransition
 from shared.messages import Belief, Frame, Percept
 from shared.weights import Weights
-from shared.windows import Window
+from shared.windows import CROP_PX, Window
 
 Image = NDArray[np.uint8]
 
@@ -28,8 +27,7 @@ class Imagination:
 
     def __init__(self, weights: Weights, names: tuple[str, ...]) -> None:
         self.cards = {card.name: card for card in weights.cards_of(names)}
-        self._decode = Stacked([weights.fill(decoder_of(weights.architecture), name, "ccn.decoder.") for name in names])
-        self._rows = {name: row for row, name in enumerate(names)}
+        self._decoders = {name: LatentDecoder(weights, name) for name in names}
         self._transitions = {name: LatentTransition(weights, name) for name in names}
 
     def window(self, percepts: list[Percept]) -> Window:
@@ -78,12 +76,6 @@ class Imagination:
         moved = np.array([[wrap(azimuth[1] - azimuth[0]), elevation[1] - elevation[0]]])
         return self._transitions[belief.object](seen.latent_mean, moved)[0][0]
 
-    @torch.inference_mode()
     def _draw(self, latents: dict[str, NDArray[np.float32]]) -> Image:
-        if not latents:
-            return np.zeros((0, CROP_PX, CROP_PX, 3), np.uint8)
-        every = torch.zeros(len(self._rows), 1, len(next(iter(latents.values()))))
-        rows = [self._rows[name] for name in latents]
-        every[rows, 0] = torch.from_numpy(np.stack(list(latents.values())))
-        drawn = self._decode(every)[rows, 0].clamp(0, 1).permute(0, 2, 3, 1).numpy()
-        return (drawn * 255 + 0.5).astype(np.uint8)
+        drawn = [self._decoders[name](latent).clip(0, 1).transpose(1, 2, 0) for name, latent in latents.items()]
+        return (np.array(drawn).reshape(-1, CROP_PX, CROP_PX, 3) * 255 + 0.5).astype(np.uint8)

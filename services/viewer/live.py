@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from contextlib import closing, suppress
+from datetime import timedelta
 from pathlib import Path
 
 import rerun as rr
@@ -23,7 +24,7 @@ from shared.wire import MessageError, decode
 NAME = "viewer"
 QUEUE_BYTES = 64 * 1024 * 1024  # of messages that wait to be shown; what does not fit is dropped and counted
 TICK_S = 0.5
-NICE = 5  # where processors are short, the agent comes first
+BATCH_S = 0.5  # of what is sent to browsers: each batch costs them a drawing
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -32,11 +33,19 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def _work(config: Config, folder: Path, inbox: Inbox) -> None:
-    os.nice(NICE)
+    step_back()
     health = Health(NAME, at=(config.run or folder.name, 0, 0))
     with (Server(config.viewer) as server, closing(ZenohBus(config.bus.endpoint, world=config.bus.world)) as bus,
           Heartbeat(bus, health, inbox.stop)):
         watch(bus, server, config, inbox, health)
+
+
+def step_back() -> None:
+    """This process, and what it starts, has what the agent leaves of the processors."""
+    try:
+        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+    except (AttributeError, OSError):  # not Linux, or not allowed
+        os.nice(19)
 
 
 def watch(bus: Bus, server: Server, config: Config, inbox: Inbox, health: Health) -> list[str]:
@@ -46,7 +55,10 @@ def watch(bus: Bus, server: Server, config: Config, inbox: Inbox, health: Health
     bus.subscribe(SHOWN, inbox.put)
     run = health.at[0]
     past = bus.recall([topic for topic in SHOWN if topic != STATUS], (run, 0, 0) if run else None, KEPT_BYTES)
-    recording = rr.RecordingStream("saccade", recording_id=run or (past[0].at[0] if past else None))
+    batches = rr.ChunkBatcherConfig.DEFAULT()
+    batches.flush_tick = timedelta(seconds=BATCH_S)
+    recording = rr.RecordingStream("saccade", recording_id=run or (past[0].at[0] if past else None),
+                                   batcher_config=batches)
     recording.connect_grpc(server.data_url)
     feed = _Feed(Viewer(recording, config, truth=config.viewer.truth, live=True), health)
     health.say(state="ready", note=server.url)

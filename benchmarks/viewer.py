@@ -1,0 +1,95 @@
+"""`python -m benchmarks.viewer [out.json]`: closed-loop steps per second without a viewer, with one that nobody uses,
+with a browser that looks, with one that is suspended, and with a viewer that is suspended; the same scenes, in turn,
+round after round. The browser draws in software, on the same processors, with what the agent leaves of them."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import psutil
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks.loop import CONFIG, Clock
+from deploy.launch import launch
+from deploy.registry import VIEWER, agent_processes
+from services.viewer.server import url_of, with_free_ports
+from shared.topics import STATUS, TRUTH
+
+ROUNDS = 4
+SUSPENDED_AT = 20  # views, after which a browser or viewer is suspended
+FLAGS = ("--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
+         "--remote-debugging-port=0", "--window-size=1600,1000")
+
+
+@contextmanager
+def browser(url: str) -> Iterator[int]:
+    """A page in headless Chromium; its process group."""
+    program = shutil.which("chromium") or shutil.which("google-chrome")
+    if program is None:
+        sys.exit("saccade: no Chromium is installed: apt-get install chromium")
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
+        child = subprocess.Popen(["chrt", "--idle", "0", program, *FLAGS, f"--user-data-dir={profile}", url],
+                                 stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
+        try:
+            yield child.pid
+        finally:
+            os.killpg(child.pid, signal.SIGKILL)
+            child.wait()
+
+
+def measure(view: bool, look: bool = False, suspend: str = "") -> float:
+    """Steps per second. `suspend`: whom, once the run is under way."""
+    config, clock, pages = with_free_ports(CONFIG), Clock(), []
+    with tempfile.TemporaryDirectory() as folder, browser(url_of(config.viewer)) if look else nullcontext() as group:
+        def see(topic, part, message) -> None:
+            if topic == STATUS and part == VIEWER.name and message.note and look and not pages:
+                pages.append(message.note)
+            clock.see(topic, part, message)
+            if suspend and len(clock.seen_s) == SUSPENDED_AT:
+                os.killpg(group if suspend == "browser" else viewer_of(folder), signal.SIGSTOP)
+
+        launch(config, Path(folder) / "loop", see, agent_processes("sceneccn", view=view), topics=(TRUTH,),
+               say=lambda text: print(text, file=sys.stderr))
+    return clock.steps_per_s
+
+
+def viewer_of(folder: str) -> int:
+    """The process of the viewer of a run in that folder."""
+    return next(p.pid for p in psutil.process_iter(["cmdline"])
+                if VIEWER.module in (line := p.info["cmdline"] or []) and any(folder in word for word in line))
+
+
+def main() -> None:
+    """Prints a table; with a file's name, writes the numbers there."""
+    ways: list[tuple[str, Callable[[], float]]] = [
+        ("no viewer", partial(measure, False)), ("viewer", partial(measure, True)),
+        ("viewer and browser", partial(measure, True, look=True)),
+        ("browser suspended", partial(measure, True, look=True, suspend="browser")),
+        ("viewer suspended", partial(measure, True, suspend="viewer"))]
+    found: dict[str, list[float]] = {name: [] for name, _ in ways}
+    for number in range(ROUNDS):
+        for name, way in ways[number % len(ways):] + ways[:number % len(ways)]:  # none is always the first
+            found[name].append(way())
+    medians = {name: float(np.median(values)) for name, values in found.items()}
+    table = Table("who looks", "steps per s", "of no viewer")
+    for name, value in medians.items():
+        table.add_row(name, f"{value:.2f}", f"{value / medians['no viewer']:.3f}")
+    Console().print(table)
+    if len(sys.argv) > 1:
+        Path(sys.argv[1]).write_text(json.dumps(found, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
