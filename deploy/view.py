@@ -16,7 +16,7 @@ from deploy.listen import bus_of, newest_run, until_interrupted
 from deploy.logs.source import LOG_NAME, Log, log_of, whole
 from deploy.supervisor import CONFIG_NAME
 from services.viewer.core import Viewer
-from services.viewer.live import QUEUE_BYTES, step_back, watch
+from services.viewer.live import QUEUE_BYTES, connected, step_back, watch
 from services.viewer.server import Server, with_free_ports
 from shared.bus import ZenohBus
 from shared.config import Config, load, validate
@@ -27,24 +27,25 @@ from shared.topics import GOAL_PERCEPT
 POLL_S = 0.2
 
 
-def view_log(log: Path, *, save: Path | None, truth: bool, port: int | None, open_page: bool,
-             weights: Path | None, console: Console) -> None:
+def view_log(path: Path, *, save: Path | None, truth: bool, port: int | None, open_page: bool, weights: Path | None,
+             console: Console) -> None:
     """Shows a log until Ctrl-C, or writes it as a file of Rerun's. Raises SaccadeError for what is no log."""
-    log = log_of(log)
-    recording = rr.RecordingStream("saccade", recording_id=log.parent.name if log.name == LOG_NAME else log.stem)
+    path = log_of(path)
+    log = Log(path, console)
+    name = path.resolve().parent.name if path.name == LOG_NAME else path.stem
+    recording = rr.RecordingStream("saccade", recording_id=name)
     if save is not None:
         with whole(save) as partial:
             recording.save(partial)
-            _show(log, recording, truth, weights, console)
+            _show(log, recording, truth, weights)
             recording.disconnect()
         _say(console, f"written to {save}: `rerun {save}` shows it")
         return
-    with Server(_ports(Config(), port).viewer) as server:
-        recording.connect_grpc(server.data_url)
-        _say(console, f"{log} at {server.url} until Ctrl-C")
+    with Server(_ports(Config(), port).viewer) as server, connected(recording, server):
+        _say(console, f"{path} at {server.url} until Ctrl-C")
         if open_page:
             webbrowser.open(server.url)
-        _show(log, recording, truth, weights, console)
+        _show(log, recording, truth, weights)
         stay(lambda: server.running)
 
 
@@ -93,16 +94,15 @@ def _of_run(endpoint: str | None, run: Path | None) -> Config:
     return load(folder / CONFIG_NAME).with_values({"run": folder.resolve().name})
 
 
-def _show(path: Path, recording: rr.RecordingStream, truth: bool, weights: Path | None,
-          console: Console) -> None:
+def _show(log: Log, recording: rr.RecordingStream, truth: bool, weights: Path | None) -> None:
     """Every message of a log; says what could not be shown."""
-    log, viewer = Log(path, console), None
+    viewer = None
     for entry, message in log:
         if viewer is None:  # the configuration stands before the first message
-            config = validate(json.loads(log.reader.configuration or "{}"), f"the log {path}")
+            config = validate(json.loads(log.reader.configuration or "{}"), f"the log {log.reader.path}")
             viewer = Viewer(recording, _with_weights(config, weights), truth=truth, live=False)
         viewer.take(entry.topic, entry.part, message)
-    _tell(viewer.close(), console)
+    _tell(viewer.close(), log.console)
 
 
 def _tell(lacks: list[str], console: Console) -> None:

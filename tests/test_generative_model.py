@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from services.perception.networks import CELLS, MASK_PX, Extraction, Identity, tally
-from shared import latent
+from shared import drawing, latent
 from shared.config import REPOSITORY
 from shared.generative_model import (
     CCN,
@@ -13,6 +13,7 @@ from shared.generative_model import (
     Encoder,
     Stacked,
     Transition,
+    decoder_of,
     kl_divergence,
     log_density,
     transition_of,
@@ -75,6 +76,17 @@ def test_what_belief_does_in_numpy_is_what_was_trained_in_torch(folder):
                                rtol=1e-3)
     prior = (np.zeros_like(mean), np.ones_like(std))
     np.testing.assert_allclose(latent.kl_divergence((mean, std), prior), kl_divergence(*expected, 0.0, 1.0), rtol=1e-3)
+
+
+@pytest.mark.parametrize("folder", ["pantry", "ycb", "ycb-paper"])
+def test_what_the_viewer_draws_in_numpy_is_what_was_trained_in_torch(folder):
+    weights = Weights(REPOSITORY / "weights" / folder)
+    start = np.random.default_rng(1).normal(size=LATENT).astype(np.float32)
+    for name in weights.names:
+        network = weights.fill(decoder_of(weights.architecture), name, drawing.PREFIX)
+        with torch.inference_mode():
+            expected = network(torch.from_numpy(start)[None])[0]
+        np.testing.assert_allclose(drawing.LatentDecoder(weights, name)(start), expected, atol=2e-5)
 
 
 def test_votes_of_the_cells_that_see_the_object_decide():

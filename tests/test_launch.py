@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -12,8 +13,9 @@ from collections import defaultdict
 
 import pytest
 
-from deploy.launch import PROCESSES, launch
+from deploy.launch import PROCESSES, launch, launched
 from deploy.logs.check import missing
+from deploy.supervisor import Process
 from shared.bus import ZenohBus, free_endpoint
 from shared.config import load
 from shared.errors import SaccadeError
@@ -87,6 +89,28 @@ def test_a_service_that_ends_is_named_with_its_reason(tmp_path, wish, message):
         launch(configuration(3, 8, wish), tmp_path / "run", None, FAKES)
     assert processes_of(tmp_path / "run") == {}
     assert not missing(tmp_path / "run" / "run.mcap").cut
+
+
+@pytest.mark.parametrize(("module", "reason"), [("tests.fakes.nothing", "it has died 6 times"),
+                                                ("services.viewer", "cannot be opened")])
+def test_a_run_goes_on_without_one_who_only_looks_on(tmp_path, module, reason):
+    """Who dies again and again, or cannot have its port, says why; nothing else happens."""
+    said, looking = [], Process("viewer", module, onlooker=True)
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        config = configuration(2, 100).with_values({"viewer.port": taken.getsockname()[1]})
+        results = launch(config, tmp_path / "run", None, (*FAKES, looking), said.append)
+    assert [result.episode for result in results] == [0, 1]
+    assert any(text.startswith("on without the viewer: ") and reason in text for text in said), said
+    assert missing(tmp_path / "run" / "run.mcap").complete
+
+
+def test_one_who_looks_on_stays_when_the_others_are_stopped(tmp_path):
+    looking = Process("replayer", "tests.fakes.onlooker", onlooker=True)
+    with launched(configuration(1, 3), tmp_path / "run", None, (*FAKES, looking)) as ended:
+        assert len(ended.results) == 1
+        assert ended.runs("replayer")
+        assert set(processes_of(tmp_path / "run")) == {"onlooker"}
+    assert processes_of(tmp_path / "run") == {}
 
 
 def test_a_port_in_use_starts_no_service(tmp_path):

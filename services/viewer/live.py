@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
-from contextlib import closing, suppress
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager, suppress
 from datetime import timedelta
 from pathlib import Path
 
@@ -59,20 +59,28 @@ def watch(bus: Bus, server: Server, config: Config, inbox: Inbox, health: Health
     batches.flush_tick = timedelta(seconds=BATCH_S)
     recording = rr.RecordingStream("saccade", recording_id=run or (past[0].at[0] if past else None),
                                    batcher_config=batches)
+    with connected(recording, server):
+        feed = _Feed(Viewer(recording, config, truth=config.viewer.truth, live=True), health)
+        health.say(state="ready", note=server.url)
+        for kept in sorted(past, key=lambda kept: kept.published_ns):
+            feed.take(kept.topic, kept.part, kept.payload)
+        for item in inbox.items(tick_s=TICK_S):
+            if not server.running:
+                raise SaccadeError("viewer: Rerun's server has ended")
+            if item is not None:
+                feed.take(*item)
+            feed.note_dropped(inbox.dropped)
+        return feed.viewer.close()
+
+
+@contextmanager
+def connected(recording: rr.RecordingStream, server: Server) -> Iterator[None]:
+    """Within it, what is logged goes to the server."""
     recording.connect_grpc(server.data_url)
-    feed = _Feed(Viewer(recording, config, truth=config.viewer.truth, live=True), health)
-    health.say(state="ready", note=server.url)
-    for kept in sorted(past, key=lambda kept: kept.published_ns):
-        feed.take(kept.topic, kept.part, kept.payload)
-    for item in inbox.items(tick_s=TICK_S):
-        if not server.running:
-            raise SaccadeError("viewer: Rerun's server has ended")
-        if item is not None:
-            feed.take(*item)
-        feed.note_dropped(inbox.dropped)
-    lacks = feed.viewer.close()
-    recording.disconnect()
-    return lacks
+    try:
+        yield
+    finally:
+        recording.disconnect()
 
 
 class _Feed:

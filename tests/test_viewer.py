@@ -1,0 +1,199 @@
+"""What the viewer makes of messages: read back from the recording that it writes for Rerun."""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import rerun as rr
+from rerun.chunk import RrdReader
+
+from deploy.run import run
+from services.viewer.core import Viewer
+from services.viewer.curves import F_TERMS, G_TERMS, entropy_nats
+from services.viewer.images import outline
+from services.viewer.words import decision, plain
+from shared.config import Config
+from shared.reading import RunReader
+from shared.topics import BELIEF, FRAME, PERCEPT, PLAN, TRUTH
+from tests.fakes.logs import story, write
+from tests.fixtures.make import GOLDEN
+from tests.front_door import call
+from tests.samples import sample
+
+NAMES = ("soup_can", "rice_box")
+
+
+class Seen:
+    """A recording: (step, values) of a component of an entity, in the order of the steps."""
+
+    def __init__(self, path) -> None:
+        self.entities: dict[str, set[str]] = defaultdict(set)
+        self._rows: dict[tuple[str, str], list] = defaultdict(list)
+        for chunk in RrdReader(path).stream().to_chunks():
+            table = chunk.to_record_batch()
+            steps = table["step"].to_pylist() if "step" in table.schema.names else [None] * table.num_rows
+            for name in (name for name in table.schema.names if ":" in name):
+                self.entities[chunk.entity_path].add(name)
+                rows = zip(steps, table[name].to_pylist(), strict=True)
+                self._rows[chunk.entity_path, name] += [row for row in rows if row[1]]
+
+    def of(self, entity: str, component: str) -> dict:
+        """The last value of each step."""
+        rows = self._rows[entity, component]
+        return dict(sorted(rows, key=lambda row: row[0])) if rows and rows[0][0] is not None else dict(rows)
+
+    def numbers(self, entity: str) -> dict:
+        return self.of(entity, "Scalars:scalars")
+
+    def words(self) -> list[str]:
+        return [text for texts in self.of("/decisions", "TextLog:text").values() for text in texts]
+
+
+def saved(monkeypatch, capsys, tmp_path, log, *options) -> tuple[Seen, str]:
+    """What `saccade view LOG --save` writes and says."""
+    code, out, err = call(monkeypatch, capsys, "view", log, "--save", tmp_path / "run.rrd", *options)
+    assert code == 0, err
+    return Seen(tmp_path / "run.rrd"), out
+
+
+def test_a_log_as_a_recording_has_everything_that_was_seen_believed_and_planned(monkeypatch, capsys, tmp_path):
+    seen, out = saved(monkeypatch, capsys, tmp_path, GOLDEN, "--truth")
+    assert out.startswith("no status: without milliseconds")  # of processes: this run was within one
+    assert out.count("without") == 1
+    messages = list(RunReader(GOLDEN))
+    frames = [m for t, _, m in messages if t == FRAME]
+    steps = [m.step for m in frames]
+    assert list(seen.of("/world/camera/image", "EncodedImage:blob")) == steps
+    places = seen.of("/world/camera", "Transform3D:translation")
+    np.testing.assert_allclose([places[m.step][0] for m in frames], [m.world_from_camera[:3, 3] for m in frames],
+                               atol=1e-6)
+    beliefs = {(p, m.step): m for t, p, m in messages if t == BELIEF}
+    for name in NAMES:
+        clouds = seen.of(f"/world/objects/{name}/particles", "Points3D:positions")
+        assert all(np.array_equal(np.float32(clouds[step]), beliefs[name, step].particles_m) for step in steps)
+    for step in steps:
+        of_step = [beliefs[name, step] for name in NAMES]
+        np.testing.assert_allclose(seen.numbers("/entropy")[step], [entropy_nats(b) for b in of_step])
+        np.testing.assert_allclose(seen.numbers("/presence")[step], [b.presence for b in of_step])
+        np.testing.assert_allclose(seen.numbers("/F")[step],
+                                   [sum(b.free_energy if term == "total" else getattr(b, f"f_{term}") for b in of_step)
+                                    for term in F_TERMS])
+    for plan in (m for t, _, m in messages if t == PLAN):
+        terms = [plan.g if term == "total" else getattr(plan, f"g_{term}") for term in G_TERMS]
+        np.testing.assert_allclose(seen.numbers("/G")[plan.step], terms)
+        np.testing.assert_allclose(seen.of("/world/candidates", "Points3D:positions")[plan.step], plan.best_eyes_m)
+    truths = {m.step: m for t, _, m in messages if t == TRUTH}
+    apart = {s: np.linalg.norm((m.world_from_camera - m.goal_world_from_camera)[:3, 3]) for s, m in truths.items()}
+    assert {s: v[0] for s, v in seen.numbers("/distance/true").items()} == pytest.approx(apart)
+    assert {"Boxes3D:half_sizes"} <= seen.entities["/world/true"]
+    assert {"Pinhole:resolution"} <= seen.entities["/world/goal"] & seen.entities["/world/viewpoint"]
+    assert seen.of("/goal/image", "EncodedImage:blob")
+    assert "did not reach the goal" in seen.words()[-1]
+
+
+def test_what_the_simulator_alone_knows_is_shown_when_asked_for(monkeypatch, capsys, tmp_path):
+    seen, _ = saved(monkeypatch, capsys, tmp_path, GOLDEN)
+    for entity in ("/world/true", "/world/goal"):
+        assert seen.entities[entity] <= {"Clear:is_recursive"}
+    assert not seen.numbers("/distance/true")
+
+
+def test_an_object_that_is_seen_has_box_mask_crop_and_reconstruction(monkeypatch, capsys, tmp_path):
+    """Pictures of the network's own: a rice box is drawn where it is seen, and where the camera is going."""
+    run(Config().with_values({"bus.kind": "local", "seed": 4, "simulator.max_steps": 8}), agent="sceneccn",
+        out=tmp_path / "run", plain=True)
+    percepts = [m for t, _, m in RunReader(tmp_path / "run" / "run.mcap") if t == PERCEPT]
+    sure = max(percepts, key=lambda m: (m.presence, m.mask().sum()))
+    seen, _ = saved(monkeypatch, capsys, tmp_path, tmp_path / "run")
+    base = f"/world/camera/image/{sure.object}"
+    ring = np.array(seen.of(f"{base}/box", "LineStrips2D:strips")[sure.step][0])
+    assert len(ring) == 5
+    assert np.allclose(ring[0], ring[4])
+    assert (ring.min(0) < sure.pixel).all()
+    assert (sure.pixel < ring.max(0)).all()
+    assert seen.of(f"{base}/box", "LineStrips2D:labels")[sure.step] == [f"{plain(sure.object)} {sure.presence:.2f}"]
+    edges = np.array(seen.of(f"{base}/mask", "LineStrips2D:strips")[sure.step])
+    rows, columns = np.nonzero(sure.mask())
+    cell = 480 / len(sure.mask())
+    assert np.allclose(edges.reshape(-1, 2).min(0), [columns.min() * cell, rows.min() * cell])
+    assert np.allclose(edges.reshape(-1, 2).max(0), [(columns.max() + 1) * cell, (rows.max() + 1) * cell])
+    assert sure.step in seen.of("/crops/image", "EncodedImage:blob")
+    assert seen.of("/world/viewpoint/imagined", "EncodedImage:blob")
+    assert len(seen.of("/crops/names", "Points2D:labels")[None]) == 5
+
+
+def test_episodes_follow_one_another_and_each_begins_empty(monkeypatch, capsys, tmp_path):
+    log = write(tmp_path / "run.mcap", story(episodes=2, steps=3), configuration=json.dumps(
+        {"scene": {"names": ["mug", "can"]}}))
+    seen, out = saved(monkeypatch, capsys, tmp_path, log)
+    assert "object 'mug' has no weights" in out
+    assert list(seen.of("/world/camera/image", "EncodedImage:blob")) == [0, 1, 2, 4, 5, 6]
+    assert 4 in seen.of("/world/objects", "Clear:is_recursive")
+    assert len(seen.of("/world/path", "LineStrips3D:strips")[4][0]) == 1
+
+
+def test_a_log_that_lacks_topics_shows_what_it_has_and_says_what_it_lacks(monkeypatch, capsys, tmp_path):
+    log = write(tmp_path / "run.mcap", (m for m in story() if m[0] not in (PERCEPT, PLAN)))
+    seen, out = saved(monkeypatch, capsys, tmp_path, log)
+    assert "no percept: without boxes, masks and crops" in out
+    assert "no plan: without candidates, viewpoints, G and decisions" in out
+    assert "no belief" not in out
+    assert any("no plan" in text for text in seen.words())
+    assert seen.of("/world/objects/mug/particles", "Points3D:positions")
+    assert seen.of("/world/camera/image", "EncodedImage:blob")
+
+
+def test_what_is_kept_of_a_step_does_not_grow_with_the_run(tmp_path):
+    """What the path adds is bounded: the last thousand steps weigh what the thousand before them did."""
+    recording = rr.RecordingStream("saccade")
+    recording.save(tmp_path / "run.rrd")
+    viewer = Viewer(recording, Config(), truth=False, live=True)
+    frame, sizes = sample(FRAME.type, run="r", episode=0), []
+    for step in range(4000):
+        viewer.take(FRAME, None, replace(frame, step=step, seq=step))
+        if step % 1000 == 999:
+            recording.flush()
+            sizes.append((tmp_path / "run.rrd").stat().st_size)
+    _, second, third = np.diff(sizes)
+    assert third < 1.05 * second
+    assert len(viewer._names) == 0
+
+
+@pytest.mark.parametrize(("changes", "presence", "words"), [
+    ({"arrived": True}, 0.9, "there"),
+    ({"mode": "search", "target": ""}, 0.1, "explore: tomato soup can unseen"),
+    ({"mode": "search", "target": "mug"}, 0.1, "look for the mug: tomato soup can unseen"),
+    ({"mode": "search", "target": ""}, 0.9, "explore: all are seen, where they are is not sure"),
+    ({"mode": "approach"}, 0.9, "approach the mug: from where it looks like the goal is not known"),
+    ({"mode": "goal", "believed_distance_m": 0.3}, 0.9, "approach: the goal's view of the mug"),
+    ({"mode": "goal", "believed_distance_m": 0.05}, 0.9, "centre the mug as in the goal")])
+def test_decisions_in_words(changes, presence, words):
+    plan = sample(PLAN.type, **{"arrived": False, "target": "mug"} | changes)
+    assert decision(plan, [sample(BELIEF.type, object="005_tomato_soup_can", presence=presence)]) == words
+
+
+def test_an_outline_goes_round_the_cells():
+    mask = np.zeros((4, 4), bool)
+    mask[0, 1] = mask[3, 3] = True
+    lines = {tuple(map(tuple, line)) for line in outline(mask)}
+    assert lines == {((1, 0), (2, 0)), ((1, 1), (2, 1)), ((1, 0), (1, 1)), ((2, 0), (2, 1)),
+                     ((3, 3), (4, 3)), ((3, 4), (4, 4)), ((3, 3), (3, 4)), ((4, 3), (4, 4))}
+
+
+@pytest.mark.parametrize(("arguments", "complaint"), [
+    ((), "give the log of a run, or --live for one that goes on"),
+    ((GOLDEN, "--live"), "give the log of a run, or --live"),
+    (("--live", "--save", "x.rrd"), "--save is for a log"),
+    ((GOLDEN, "--run", "runs/x"), "--run and --endpoint are for a run that goes on"),
+    (("nowhere.mcap",), "nowhere.mcap cannot be read: No such file or directory"),
+    ((__file__,), "test_viewer.py is not an MCAP file"),
+    (("--live", "--run", "nowhere"), "configuration nowhere/config.json cannot be read"),
+    ((GOLDEN, "--save", GOLDEN), "is there already: name a new place")])
+def test_what_cannot_be_viewed_is_said_in_one_line(monkeypatch, capsys, tmp_path, arguments, complaint):
+    code, _, err = call(monkeypatch, capsys, "view", *arguments)
+    assert (code, err.count("\n")) == (2, 1)
+    assert complaint in err
