@@ -6,7 +6,6 @@ Two ports: the page, which comes through a door of ours, and the data. Rerun's u
 from __future__ import annotations
 
 import ctypes
-import json
 import os
 import signal
 import socket
@@ -90,11 +89,10 @@ class Server:
 
     def _environment(self) -> dict[str, str]:
         """A home of its own, in which analytics are off."""
-        config = Path(self._home.name) / ".config" / "rerun" / "analytics.json"
-        config.parent.mkdir(parents=True)
-        config.write_text(json.dumps({"analytics_enabled": False, "analytics_id": "", "metadata": {}}))
         kept = {name: value for name, value in os.environ.items() if not name.startswith("XDG_")}
-        return {**kept, "HOME": self._home.name, "RUST_LOG": "warn", "NO_COLOR": "1"}
+        environment = {**kept, "HOME": self._home.name, "RUST_LOG": "warn", "NO_COLOR": "1"}
+        subprocess.run([binary(), "analytics", "disable"], env=environment, capture_output=True, check=True)
+        return environment
 
 
 def url_of(config: ViewerConfig) -> str:
