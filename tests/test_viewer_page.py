@@ -1,0 +1,145 @@
+"""The viewer's page in a real browser: headless Chromium, drawing in software."""
+
+from __future__ import annotations
+
+import io
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+from PIL import Image
+from playwright.sync_api import sync_playwright
+
+from services.viewer.server import binary, free_port
+from shared.config import REPOSITORY
+from tests.fixtures.make import GOLDEN
+from tests.test_viewer import Seen
+
+ARTEFACTS = REPOSITORY / "artefacts"
+WAIT_S = 120
+FLAGS = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+SIZE = {"width": 1400, "height": 860}
+# left, top, right and bottom of what the layout puts there, as shares of the page
+PLACES = {"world": (0.02, 0.10, 0.48, 0.75), "camera": (0.51, 0.09, 0.66, 0.32), "goal": (0.68, 0.09, 0.82, 0.32),
+          "crops": (0.55, 0.37, 0.95, 0.50), "distance": (0.52, 0.56, 0.74, 0.72), "entropy": (0.78, 0.56, 0.98, 0.72),
+          "decisions": (0.02, 0.85, 0.45, 0.95)}
+MOVES = ("world", "camera", "distance", "decisions")
+
+CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: apt-get install chromium")
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=[*FLAGS, "--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+@contextmanager
+def saccade(*arguments: object):
+    """A command of ours, interrupted at the end."""
+    child = subprocess.Popen([sys.executable, "-m", "deploy.cli", *map(str, arguments)], text=True,
+                             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, env=os.environ | {"COLUMNS": "200"})
+    try:
+        yield child
+    finally:
+        child.send_signal(signal.SIGINT)
+        child.communicate(timeout=WAIT_S)
+
+
+class Page:
+    """The page as it is drawn."""
+
+    def __init__(self, browser, port: int) -> None:
+        self.page = browser.new_page(viewport=SIZE)
+        self.answered: set[str] = set()
+        self.page.on("response", lambda response: self.answered.add(urlsplit(response.url).hostname))
+        end_s = time.monotonic() + WAIT_S
+        while time.monotonic() < end_s:
+            try:
+                self.page.goto(f"http://127.0.0.1:{port}/")
+                return
+            except Exception:  # it is not open yet
+                time.sleep(0.3)
+        pytest.fail(f"no page at port {port}")
+
+    def shot(self, path: Path | None = None) -> dict[str, np.ndarray]:
+        """The pixels of every place."""
+        data = self.page.screenshot(path=path)
+        pixels = np.asarray(Image.open(io.BytesIO(data)).convert("RGB")).astype(np.int16)
+        height, width = pixels.shape[:2]
+        return {name: pixels[int(t * height):int(b * height), int(x * width):int(r * width)]
+                for name, (x, t, r, b) in PLACES.items()}
+
+    def until(self, wanted) -> dict[str, np.ndarray]:
+        """The first shot of which `wanted(shot)` names nothing that lacks."""
+        end_s, lacking = time.monotonic() + WAIT_S, ["a page"]
+        while time.monotonic() < end_s:
+            shot = self.shot()
+            if not (lacking := wanted(shot)):
+                return shot
+            time.sleep(0.5)
+        self.shot(ARTEFACTS / "viewer_lacks.png")
+        return pytest.fail(f"the page shows nothing in: {', '.join(lacking)}; see {ARTEFACTS / 'viewer_lacks.png'}")
+
+
+def empty(shot: dict[str, np.ndarray]) -> list[str]:
+    """Places without content: of one colour, or nearly."""
+    return [name for name, pixels in shot.items() if share_unlike_background(pixels) < 0.002]
+
+
+def share_unlike_background(pixels: np.ndarray) -> float:
+    values, counts = np.unique(pixels.reshape(-1, 3), axis=0, return_counts=True)
+    return float((np.abs(pixels - values[counts.argmax()]).max(-1) > 24).mean())
+
+
+@pytest.mark.filterwarnings("ignore:RRD file has no footer")  # the late one is interrupted
+def test_a_running_episode_is_seen_and_moves(browser, tmp_path):
+    """World, images, curves and words have content that changes from step to step; nobody else is heard of; who comes
+    late sees the run from its start."""
+    port, data_port = free_port("127.0.0.1"), free_port("127.0.0.1")
+    ARTEFACTS.mkdir(exist_ok=True)
+    with saccade("run", "--view", "--plain", "--count", "50", "--seed", "5", "--set", f"viewer.port={port}", "--set",
+                 f"viewer.data_port={data_port}", "--set", "viewer.truth=true", "--out", tmp_path / "run") as run:
+        page = Page(browser, port)
+        first = page.until(empty)
+        page.until(lambda shot: [name for name in MOVES if np.abs(shot[name] - first[name]).max() < 48])
+        page.shot(ARTEFACTS / "viewer_live.png")
+        assert run.poll() is None  # that was while it ran
+        assert page.answered == {"127.0.0.1"}
+        late = tmp_path / "late.rrd"
+        with subprocess.Popen([binary(), "--save", late, f"rerun+http://127.0.0.1:{data_port}/proxy"],
+                              stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as other:
+            end_s = time.monotonic() + WAIT_S
+            while not (late.exists() and late.stat().st_size > 500_000) and time.monotonic() < end_s:
+                time.sleep(0.2)
+            other.send_signal(signal.SIGINT)
+        page.page.close()
+    seen = Seen(late)
+    steps = list(seen.of("/world/camera/image", "EncodedImage:blob"))
+    assert steps[:5] == [0, 1, 2, 3, 4]
+    for entity in ("/world/path", "/world/candidates", "/world/viewpoint/imagined", "/world/true", "/goal/image", "/F",
+                   "/G", "/entropy", "/presence", "/distance/true", "/decisions", "/milliseconds/perception"):
+        assert seen.entities[entity], entity
+
+
+def test_a_log_is_seen(browser):
+    port = free_port("127.0.0.1")
+    ARTEFACTS.mkdir(exist_ok=True)
+    with saccade("view", GOLDEN, "--port", port, "--truth") as view:
+        page = Page(browser, port)
+        page.until(empty)
+        page.shot(ARTEFACTS / "viewer_log.png")
+        page.page.close()
+        assert view.poll() is None
+    assert view.returncode == 0
