@@ -173,10 +173,15 @@ def table_from_above(axes: Axes, title: str) -> None:
 
 def particles(axes: Axes, beliefs: dict[str, Belief], names: Iterable[str]) -> None:
     """Where objects are believed to be; each of `names` keeps its colour, whichever of them are drawn."""
-    for colour, name in zip(cycle(COLOURS), sorted(names), strict=False):
+    for name, colour in colours(names).items():
         if name in beliefs:
             axes.scatter(*beliefs[name].particles_m[:, :2].T, s=4, color=colour, alpha=0.35, linewidths=0, zorder=2)
             axes.plot(*beliefs[name].mean_m[:2], "o", color=colour, markersize=7, label=name, zorder=3)
+
+
+def colours(names: Iterable[str]) -> dict[str, str]:
+    """A colour for each object."""
+    return dict(zip(sorted(names), cycle(COLOURS), strict=False))
 
 
 def way(axes: Axes, path_m: NDArray[np.float64]) -> None:

@@ -59,3 +59,16 @@ def picture(log: Log,
     target = out or file.with_name(PICTURE_NAME)
     draw(file, target, episode)
     print(f"written to {target}")
+
+
+@app.command()
+def film(log: Log, out: Annotated[Path, typer.Argument(help="OUT.mp4 or OUT.gif", metavar="OUT")], *,
+         episode: Annotated[int | None, typer.Option(min=0, help="which one [default: the last]")] = None,
+         rate: Annotated[float, typer.Option(min=0.5, max=60, help="steps a second")] = 5.0) -> None:
+    """Make a short film of an episode from its log: for a paper, a README."""
+    from rich.console import Console
+
+    from deploy.film import film as make_film
+
+    make_film(log, out, episode=episode, rate_hz=rate, console=Console(stderr=True))
+    print(f"written to {out}")

@@ -127,7 +127,7 @@ class Viewer:
     def _percept(self, percept: Percept) -> None:
         self._step.percepts[percept.object] = percept
         width = self._step.frame.rgb.shape[1] if self._step.frame else 480
-        self._images.percept(percept, width, percept.world_from_camera[2, :3])
+        self._images.percept(percept, width)
 
     def _belief(self, belief: Belief) -> None:
         self._step.beliefs[belief.object] = self._believed[belief.object] = belief

@@ -9,7 +9,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from services.viewer.imagination import Imagination
-from services.viewer.layout import CELL_PX, VIEW_PX, Colour
+from services.viewer.layout import CELL_PX, ROW_PX, VIEW_PX, Colour
 from services.viewer.words import SEEN, plain
 from services.viewer.world import CAMERA, VIEWPOINT
 from shared.messages import Belief, Frame, Goal, Percept, Plan
@@ -29,7 +29,7 @@ class Images:
         self._to, self._names, self._colour_of, self._imagination = recording, names, colour_of, imagination
         self.begin()
         if imagination:
-            places = [((k + 0.5) * CELL_PX, 2 * CELL_PX) for k in range(len(names))]
+            places = [((k + 0.5) * CELL_PX, 2 * ROW_PX) for k in range(len(names))]
             self._to.log("crops/names", rr.Points2D(places, labels=[plain(name) for name in names], radii=2.0,
                                                     colors=[colour_of(name) for name in names], show_labels=True),
                          static=True)
@@ -50,8 +50,8 @@ class Images:
         """What the camera sees."""
         self._image(CAMERA_IMAGE, frame.rgb)
 
-    def percept(self, percept: Percept, width_px: int, up: NDArray[np.float64]) -> None:
-        """Box, mask, name and presence of an object in the image; `up` [3]: which way is up, in the camera's frame."""
+    def percept(self, percept: Percept, width_px: int) -> None:
+        """Box, mask, name and presence of an object in the image."""
         path = f"{CAMERA_IMAGE}/{rr.escape_entity_path_part(percept.object)}"
         if percept.presence < SEEN:
             self._to.log(path, rr.Clear(recursive=True))
@@ -62,10 +62,8 @@ class Images:
             self._to.log(f"{path}/box", rr.Points2D([percept.pixel], radii=DOT_PX, colors=[colour], labels=[label],
                                                     show_labels=True))
         else:
-            corners = self._imagination.window([percept]).pixels_of(2, percept.intrinsics_px, up)[0]
-            middle, reach = corners.mean((0, 1)), 2.0  # from the centres of 2x2 cells to the corners
-            ring = middle + reach * (corners.reshape(4, 2)[[0, 1, 3, 2, 0]] - middle)
-            self._to.log(f"{path}/box", rr.LineStrips2D([ring], colors=[colour], labels=[label], show_labels=True))
+            self._to.log(f"{path}/box", rr.LineStrips2D([self._imagination.frame_of(percept)], colors=[colour],
+                                                        labels=[label], show_labels=True))
         mask = percept.mask()
         if mask is not None and mask.any():
             self._to.log(f"{path}/mask", rr.LineStrips2D(outline(mask) * (width_px / len(mask)), colors=[colour],
@@ -78,11 +76,11 @@ class Images:
             return
         columns = np.concatenate([self._imagination.crops(frame, ordered),
                                   self._imagination.reconstructions(ordered)], axis=1) if ordered else ()
-        canvas = np.zeros((2 * CELL_PX, len(self._names) * CELL_PX, 3), np.uint8)
+        canvas = np.zeros((2 * ROW_PX, len(self._names) * CELL_PX, 3), np.uint8)
         for percept, column in zip(ordered, columns, strict=True):
-            left = self._names.index(percept.object) * CELL_PX
+            left = self._names.index(percept.object) * CELL_PX + (CELL_PX - CROP_PX) // 2
             canvas[:CROP_PX, left:left + CROP_PX] = column[:CROP_PX]
-            canvas[CELL_PX:CELL_PX + CROP_PX, left:left + CROP_PX] = column[CROP_PX:]
+            canvas[ROW_PX:ROW_PX + CROP_PX, left:left + CROP_PX] = column[CROP_PX:]
         self._image(CROPS, canvas)
 
     def plan(self, plan: Plan, beliefs: dict[str, Belief]) -> None:

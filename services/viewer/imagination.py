@@ -35,6 +35,13 @@ class Imagination:
         return Window(np.array([p.pixel for p in percepts]), np.array([p.scale for p in percepts]),
                       np.array([self.cards[p.object].crop_side_m for p in percepts]))
 
+    def frame_of(self, percept: Percept) -> NDArray[np.float64]:
+        """The frame of an object's crop in the image, once round [5, 2], pixels."""
+        up = percept.world_from_camera[2, :3]
+        corners = self.window([percept]).pixels_of(2, percept.intrinsics_px, up)[0]
+        middle, reach = corners.mean((0, 1)), 2.0  # from the centres of 2x2 cells to the corners
+        return middle + reach * (corners.reshape(4, 2)[[0, 1, 3, 2, 0]] - middle)
+
     def crops(self, frame: Frame, percepts: list[Percept]) -> Image:
         """What the networks look at [K, 64, 64, 3]; black beyond the image."""
         up = frame.world_from_camera[2, :3]
