@@ -5,7 +5,7 @@ SACCADE = .venv/bin/saccade
 .PHONY: run up test test-compose lint bench fixtures clean
 
 run: .venv/.installed
-	$(SACCADE) run
+	$(SACCADE) run --view
 
 test: .venv/.installed-dev lint
 	.venv/bin/python -m pytest -q

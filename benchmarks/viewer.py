@@ -23,7 +23,8 @@ from rich.table import Table
 
 from benchmarks.loop import CONFIG, Clock
 from deploy.launch import launch
-from deploy.registry import VIEWER, agent_processes
+from deploy.registry import agent_processes
+from deploy.supervisor import VIEWER
 from services.viewer.server import url_of, with_free_ports
 from shared.topics import STATUS, TRUTH
 

@@ -16,7 +16,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from deploy.supervisor import CONFIG_NAME, HUNG_KILLED_S, KEEP_PAGES, STOP_S
+from deploy.supervisor import CONFIG_NAME, HUNG_KILLED_S, KEEP_PAGES, STOP_S, VIEWER
 from deploy.threads import VARIABLES
 from shared.bus import ROUTER_WAIT_VARIABLE
 from shared.errors import SaccadeError
@@ -25,7 +25,8 @@ from shared.process import EXIT_ERROR, HEARTBEAT_VARIABLE, LAUNCHER_VARIABLE
 RUNS_VARIABLE, HEARTBEATS_VARIABLE = "SACCADE_RUNS", "SACCADE_HEARTBEATS"
 WORLD_VARIABLE, WAIT_VARIABLE = "SACCADE_WORLD", "SACCADE_WAIT"
 LATEST, OVER = "latest", "over"  # in the folder of the runs, and in the one of a run
-ONE_FOR_ALL = ("router",)  # worlds share it
+ONE_FOR_ALL = ("router", "viewer")  # worlds share the first, and the other shows the first of them
+VIEW_VARIABLE, VIEW_S = "SACCADE_VIEW_S", 300.0  # for so long a run that is over can still be looked at
 POLL_S = 0.2
 ROUTER_S = 60.0  # for the router to answer: containers start in any order
 EXIT_AGAIN = 1
@@ -95,6 +96,8 @@ class Container:
             if self._died() or self._hung():
                 self._end()
                 return EXIT_AGAIN
+        if self._name == VIEWER.name:
+            self._stopping.wait(float(os.environ.get(VIEW_VARIABLE, VIEW_S)))
         self._end()
         return EXIT_ERROR if any(child.returncode == EXIT_ERROR for child in self._children.values()) else 0
 

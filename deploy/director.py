@@ -30,6 +30,7 @@ from deploy.launch import LOG_NAME, Graph, follow, messages, resolve
 from deploy.options import configured, numbers, weights_folder
 from deploy.registry import DEFAULT_WORLD, WORLDS, agent_processes, world_of
 from deploy.supervisor import CONFIG_NAME, HUNG_S, Process
+from services.viewer.server import url_of
 from shared.bus import ZenohBus
 from shared.config import Config, load
 from shared.errors import SaccadeError
@@ -55,6 +56,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--source", help="of a camera's images: a folder or a video")
     parser.add_argument("--poses", help="where that camera was: JSON lines or TUM")
     parser.add_argument("--intrinsics", metavar="fx,fy,cx,cy", help="of its images, in pixels")
+    parser.add_argument("--view-port", type=int, help="of the viewer's page, open to other hosts")
+    parser.add_argument("--view-data-port", type=int, default=9876, help="of its data")
     parser.add_argument("--set", default="", metavar="'KEY=VALUE ...'", help="configuration by dotted keys")
     told = parser.parse_args(argv)
     signal.signal(signal.SIGTERM, lambda *_: os._exit(0))  # its threads wait for messages; nothing is unsaved
@@ -65,6 +68,9 @@ def main(argv: Sequence[str] | None = None) -> None:
                  "camera.intrinsics_px": numbers(told.intrinsics or None)}
         if world_of(told.world).live:  # there is nobody to draw scenes, and nobody waits
             given |= {"scene.count": None, "scene.explore": True, "bus.live": True}
+        if told.view_port:
+            given |= {"viewer.address": "0.0.0.0", "viewer.port": told.view_port,
+                      "viewer.data_port": told.view_data_port}
         config = configured(None, given, shlex.split(told.set))
         direct(config, told.world, told.worlds, runs_folder(), Console(width=200))
     except SaccadeError as error:
@@ -78,6 +84,8 @@ def direct(config: Config, world: str, worlds: int, runs: Path, console: Console
     folders = prepare(resolve(config, processes), worlds, runs)
     with _Beating():
         console.print(f"run {folders[0].parent.name if worlds > 1 else folders[0].name}: waits for its services")
+        if config.viewer.data_port:
+            console.print(f"look at {url_of(config.viewer)}", highlight=False)
         with ThreadPoolExecutor(worlds) as pool:
             found = list(pool.map(lambda folder: _follow(folder, processes, console, worlds), folders))
     for folder in folders:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from importlib import import_module
 
 from deploy.launch import JUDGE
-from deploy.supervisor import Process
+from deploy.supervisor import VIEWER, Process
 from deploy.threads import limit_torch
 from shared.config import Config
 from shared.errors import SaccadeError
@@ -18,7 +18,6 @@ from shared.topics import TRUTH
 Pair = tuple[Service, Core]
 
 ROUTER, RECORDER = "router", "recorder"
-VIEWER = Process("viewer", "services.viewer", onlooker=True)
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,8 @@ from rich.console import Console
 from deploy.display import Display
 from deploy.ending import ending
 from deploy.launch import launched
-from deploy.registry import DEFAULT_WORLD, VIEWER, agent_of, agent_processes, local_pairs, world_of
-from deploy.supervisor import CONFIG_NAME
+from deploy.registry import DEFAULT_WORLD, agent_of, agent_processes, local_pairs, world_of
+from deploy.supervisor import CONFIG_NAME, VIEWER
 from services.camera.core import build as build_camera
 from services.camera.sources import absolute, webcam_number
 from services.recorder.core import LOG_NAME, describe

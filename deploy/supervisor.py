@@ -39,6 +39,9 @@ class Process:
     onlooker: bool = False
 
 
+VIEWER = Process("viewer", "services.viewer", onlooker=True)
+
+
 class Supervisor:
     """One child process per service. `say(text)` is told what happens to them."""
 

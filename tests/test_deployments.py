@@ -12,7 +12,7 @@ import yaml
 from deploy.registry import agent_processes
 from shared.config import REPOSITORY
 
-PROCESSES = {process.name: process.module for process in agent_processes("sceneccn")}
+PROCESSES = {process.name: process.module for process in agent_processes("sceneccn", view=True)}
 BESIDE = {"director"}  # in the launcher's place
 KUBERNETES = REPOSITORY / "deploy" / "kubernetes"
 VERSION = "1.31"

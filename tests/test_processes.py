@@ -14,6 +14,7 @@ NEEDS = {
     "perception": {"torch"},
     "belief": {"filterpy", "scipy"},
     "planner": {"scipy"},
+    "viewer": set(),
 }
 
 

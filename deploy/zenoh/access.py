@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from deploy.registry import AGENTS, WORLDS, service_of
+from services.viewer import SHOWN
 from shared.service import Service
 from shared.topics import BELIEF, PLAN, RESULT, ROOT, STATUS, TRUTH, Topic
 
@@ -17,6 +18,7 @@ MET = ["liveliness_token", "liveliness_query", "declare_liveliness_subscriber"]
 READERS: dict[str, tuple[Topic, ...] | None] = {  # beside the services that declare what they read; None: everything
     "recorder": None,
     "director": (TRUTH, PLAN, BELIEF, STATUS, RESULT),
+    "viewer": SHOWN,
 }
 
 

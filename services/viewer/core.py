@@ -22,7 +22,6 @@ from shared.stepper import settle
 from shared.topics import BELIEF, FRAME, GOAL, PERCEPT, PLAN, RESULT, STATUS, TRUTH, Topic
 from shared.weights import Weights
 
-SHOWN = (FRAME, GOAL, PERCEPT, BELIEF, PLAN, TRUTH, RESULT, STATUS)
 WITHOUT = {  # what is not there to be seen without a topic
     FRAME: "the camera and what it sees", GOAL: "the goal", PERCEPT: "boxes, masks and crops",
     BELIEF: "particles, beliefs, entropy and F", PLAN: "candidates, viewpoints, G and decisions",

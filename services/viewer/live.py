@@ -10,7 +10,8 @@ from pathlib import Path
 
 import rerun as rr
 
-from services.viewer.core import SHOWN, Viewer
+from services.viewer import SHOWN
+from services.viewer.core import Viewer
 from services.viewer.server import Server
 from shared.bus import Bus, ZenohBus
 from shared.config import Config

@@ -26,7 +26,9 @@ class Compose:
     def __init__(self, folder: Path) -> None:
         self.folder, self.project, self.port = folder, f"saccade-test-{os.getpid()}", free_port()
         self._environment = {name: value for name, value in os.environ.items() if not name.startswith("SACCADE_")}
-        self._environment |= {"SACCADE_UID": str(USER), "SACCADE_GID": str(USER), "SACCADE_PORT": str(self.port)}
+        self._environment |= {"SACCADE_UID": str(USER), "SACCADE_GID": str(USER), "SACCADE_PORT": str(self.port),
+                              "SACCADE_VIEW_PORT": str(free_port()), "SACCADE_VIEW_DATA_PORT": str(free_port()),
+                              "SACCADE_VIEW_S": "0"}
 
     def __call__(self, *arguments: str, timeout_s: float = RUN_S, check: bool = True, **environment: str) -> str:
         """What it prints. With `check` its exit code is 0."""

@@ -17,7 +17,7 @@ from tests.compose.conftest import BUILD_S, USER
 from tests.fakes.camera import LENS_PX, film
 from tests.samples import sample
 
-SERVICES = ("router", "simulator", "perception", "belief", "planner", "evaluator", "recorder")
+SERVICES = ("router", "simulator", "perception", "belief", "planner", "evaluator", "recorder", "viewer")
 
 
 def results(path) -> list:
