@@ -154,7 +154,7 @@ def test_access_follows_the_declarations():
     rules = {rule["id"]: rule["key_exprs"] for rule in access_control()["rules"]}
     assert [user for user in users() if "saccade/*/action" in rules[f"{user} says"]] == ["planner"]
     readers = {user for user in users() if {"saccade/*/truth", "saccade/**"} & set(rules[f"{user} asks"])}
-    assert readers == {"evaluator", "recorder", "director"}
+    assert readers == {"evaluator", "recorder", "director", "viewer"}
     assert set(declared()) == {"belief", "camera", "evaluator", "perception", "planner", "simulator"}
 
 

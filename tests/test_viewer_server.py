@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import numpy as np
 import psutil
@@ -73,6 +74,19 @@ def test_it_listens_on_the_loopback_alone_and_tells_nobody_that_it_is_used(serve
     assert listening == {"127.0.0.1"}
     home = Path(children[0].environ()["HOME"])
     assert json.loads((home / ".config" / "rerun" / "analytics.json").read_text())["analytics_enabled"] is False
+
+
+def test_opened_to_other_hosts_its_page_may_come_from_any_of_its_names():
+    with Server(configured(address="0.0.0.0")) as server:
+        assert server.url.startswith("http://localhost:")
+        asked = {"Access-Control-Request-Method": "POST", "Access-Control-Request-Headers": "x-grpc-web"}
+        connection = http.client.HTTPConnection("127.0.0.1", server.data_port, timeout=WAIT_S)
+        ours = f"http://studio.local:{urlsplit(server.url).port}"
+        for origin, allowed in ((ours, ours), ("http://elsewhere.example", None)):
+            connection.request("OPTIONS", "/", headers=asked | {"Origin": origin})
+            answer = connection.getresponse()
+            answer.read()
+            assert answer.headers["Access-Control-Allow-Origin"] == allowed
 
 
 def test_what_it_keeps_is_bounded():

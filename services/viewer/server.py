@@ -39,7 +39,7 @@ class Server:
         self.address, self.url = config.address, url_of(config)
         pages = free_port(config.address)
         self._door = open_door(config, here(config.address), pages, self.data_port)
-        self._child = self._start(pages, config.memory_mb)
+        self._child = self._start(config, pages)
         threading.Thread(target=self._door.serve_forever, name="door", daemon=True).start()
 
     @property
@@ -67,12 +67,12 @@ class Server:
             self._child.wait()
         self._home.cleanup()
 
-    def _start(self, pages: int, memory_mb: int) -> subprocess.Popen:
+    def _start(self, config: ViewerConfig, pages: int) -> subprocess.Popen:
         log = Path(self._home.name) / "log"
         command = [binary(), "--serve-web", "--bind", self.address, "--port", str(self.data_port), "--web-viewer-port",
-                   str(pages), "--server-memory-limit", f"{memory_mb}MB"]
+                   str(pages), "--server-memory-limit", f"{config.memory_mb}MB"]
         if self.address != LOOPBACK:
-            command += ["--cors-allow-origin", f"http://*:{self.port}"]
+            command += ["--cors-allow-origin", f"http://*:{config.port}"]
         with log.open("wb") as out:
             child = subprocess.Popen(command, env=self._environment(), stdin=subprocess.DEVNULL, stdout=out,
                                      stderr=subprocess.STDOUT, start_new_session=True, preexec_fn=_end_with_parent())
