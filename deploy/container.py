@@ -1,8 +1,9 @@
 """`python -m deploy.container SERVICE`: a service where something else starts and restarts it, such as Docker.
 
 One process for each world of the newest run in SACCADE_RUNS, or for world number SACCADE_WORLD alone, until that run is
-over. With SACCADE_WAIT set it waits until there is one. It ends with code 1 when one of them died or hung, so that it
-is started again; a service that said why it cannot run stays down until then.
+over; the viewer shows the first of them and stays for SACCADE_VIEW_S seconds more. With SACCADE_WAIT set it waits until
+there is one. It ends with code 1 when one of them died or hung, so that it is started again; a service that said why it
+cannot run stays down until then.
 """
 
 from __future__ import annotations
@@ -96,10 +97,16 @@ class Container:
             if self._died() or self._hung():
                 self._end()
                 return EXIT_AGAIN
-        if self._name == VIEWER.name:
-            self._stopping.wait(float(os.environ.get(VIEW_VARIABLE, VIEW_S)))
+        self._stay()
         self._end()
         return EXIT_ERROR if any(child.returncode == EXIT_ERROR for child in self._children.values()) else 0
+
+    def _stay(self) -> None:
+        """A run that is over can still be looked at."""
+        stay_s = float(os.environ.get(VIEW_VARIABLE, VIEW_S))
+        if self._name == VIEWER.name and stay_s and not self._stopping.is_set():
+            print(f"saccade: the run is over and stays to be seen for {stay_s:.0f} s", file=sys.stderr, flush=True)
+            self._stopping.wait(stay_s)
 
     def _died(self) -> bool:
         codes = {world: child.poll() for world, child in self._children.items()}

@@ -17,7 +17,7 @@ PATH, TRUE, PLANNED, TABLE = (150, 150, 150), (230, 30, 230), (255, 200, 0), (90
 BACKGROUND = (20, 22, 26)
 EYE_M, EYE_TARGET_M = (0.62, -0.86, 0.72), (0.0, 0.0, 0.12)
 VIEW_PX = 240  # side of the planned view
-CELL_PX, ROW_PX, NAME_PX = 120, 66, 16  # of the crops' picture: room for a crop and its name
+CELL_PX, ROW_PX, NAME_PX = 120, 66, 24  # of the crops' picture: room for a crop and its name
 STEPS_PER_S = 5.0
 CURVES = {
     "distance": "distance to the goal (m)", "entropy": "entropy of each position (nats)", "F": "free energy F (nats)",

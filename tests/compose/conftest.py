@@ -24,10 +24,11 @@ class Compose:
     """`docker compose` in a clone, as a project of its own."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder, self.project, self.port = folder, f"saccade-test-{os.getpid()}", free_port()
+        self.folder, self.project = folder, f"saccade-test-{os.getpid()}"
+        self.port, self.view_port, view_data_port = free_port(), free_port(), free_port()
         self._environment = {name: value for name, value in os.environ.items() if not name.startswith("SACCADE_")}
         self._environment |= {"SACCADE_UID": str(USER), "SACCADE_GID": str(USER), "SACCADE_PORT": str(self.port),
-                              "SACCADE_VIEW_PORT": str(free_port()), "SACCADE_VIEW_DATA_PORT": str(free_port()),
+                              "SACCADE_VIEW_PORT": str(self.view_port), "SACCADE_VIEW_DATA_PORT": str(view_data_port),
                               "SACCADE_VIEW_S": "0"}
 
     def __call__(self, *arguments: str, timeout_s: float = RUN_S, check: bool = True, **environment: str) -> str:

@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import os
 import re
+import signal
 import socket
 import subprocess
+from http.client import HTTPConnection
+from urllib.parse import parse_qs, urlsplit
 
 import pytest
+from rerun.chunk import RrdReader
 
+from services.viewer.server import binary
 from shared.bus import ZenohBus
 from shared.reading import RunReader
 from shared.topics import ACTION, PERCEPT, RESULT
@@ -42,6 +47,25 @@ def test_up_runs_an_episode_prints_its_result_and_leaves_the_log_to_the_user(com
         assert told["HostConfig"]["Memory"] > 0
         assert any(probe["ExitCode"] == 0 for probe in told["State"]["Health"]["Log"])
         assert told["HostConfig"]["LogConfig"]["Config"]["max-size"]
+
+
+def test_the_run_can_be_seen_while_it_goes_on_and_for_a_while_after(compose):
+    """As a browser comes to it: the page, and the data that it names. It holds nobody up and ends by itself."""
+    compose("up", "--detach", SACCADE_VIEW_S="20")
+    compose.until_said("stays to be seen for 20 s")
+    page = HTTPConnection("127.0.0.1", compose.view_port, timeout=20)
+    page.request("GET", "/")
+    sent = page.getresponse()
+    sent.read()
+    data, = parse_qs(urlsplit(sent.headers["Location"]).query)["url"]
+    late = compose.folder / "late.rrd"
+    with subprocess.Popen([binary(), "--save", late, data], stdout=subprocess.DEVNULL) as browser:
+        compose("wait", "viewer")
+        browser.send_signal(signal.SIGINT)
+    seen = {chunk.entity_path for chunk in RrdReader(late).stream().to_chunks()}
+    assert {"/world/camera/image", "/world/candidates", "/crops/image", "/F", "/G", "/decisions"} <= seen
+    assert compose.inspect("viewer")["State"]["ExitCode"] == 0
+    assert compose.log().complete
 
 
 def test_a_folder_that_docker_makes_is_given_to_the_services(compose):
