@@ -78,7 +78,7 @@ class Live:
 
     def __init__(self, wanted: Wanted, endpoint: str, world: str, limit_bytes: int = QUEUE_BYTES) -> None:
         self.wanted, self.world, self.inbox = wanted, world, Inbox(limit_bytes)
-        self._bus = ZenohBus(endpoint, world=world, timeout_s=CONNECT_S)
+        self._bus = ZenohBus(endpoint, world=world, onlooker=True, timeout_s=CONNECT_S)
 
     @property
     def dropped(self) -> int:

@@ -55,7 +55,8 @@ def view_live(*, endpoint: str | None, run: Path | None, truth: bool, port: int 
     step_back()
     config = _ports(_with_weights(_of_run(endpoint, run), weights), port).with_values({"viewer.truth": truth})
     inbox = Inbox(QUEUE_BYTES)
-    with closing(ZenohBus(config.bus.endpoint, world=config.bus.world)) as bus, Server(config.viewer) as server:
+    with (closing(ZenohBus(config.bus.endpoint, world=config.bus.world, onlooker=True)) as bus,
+          Server(config.viewer) as server):
         if not config.scene.names:
             names = sorted({kept.part for kept in bus.recall((GOAL_PERCEPT,)) if kept.part})
             config = config.with_values({"scene.names": names})

@@ -18,13 +18,12 @@ from typing import Protocol
 from shared.errors import SaccadeError
 from shared.outbox import PAGE_BYTES, Kept, Since
 from shared.topics import ROOT, Topic, parse_key
-from shared.wire import MAX_BYTES, MessageError, stamp_of
+from shared.wire import MessageError, stamp_of
 
 Deliver = Callable[[Topic, str | None, bytes], None]  # runs on the bus's thread: must only put its arguments somewhere
 Answer = Callable[[Iterable[Topic], Since | None, int], list[Kept]]
 Met = Callable[[frozenset[str]], None]
 
-CONFIG_VARIABLE = "ZENOH_CONFIG"  # a file of Zenoh's settings to begin with: certificates, passwords, access
 ROUTER_WAIT_VARIABLE, ROUTER_S = "SACCADE_ROUTER_S", 10.0
 RECALL_S = 3.0  # for an answer to be whole: a publisher that hangs must not hang who asks it
 
@@ -112,11 +111,15 @@ class ZenohBus:
 
     Raises SaccadeError if the endpoint is in use (listen), malformed, or does not answer within `timeout_s` seconds,
     which are 10 unless SACCADE_ROUTER_S says otherwise.
-    A router that goes away later is found again when it comes back.
+    A router that goes away later is found again when it comes back. For an `onlooker` nobody waits: what it is too slow
+    for it misses.
     """
 
-    def __init__(self, endpoint: str, *, world: str, listen: bool = False, timeout_s: float | None = None) -> None:
+    def __init__(self, endpoint: str, *, world: str, listen: bool = False, onlooker: bool = False,
+                 timeout_s: float | None = None) -> None:
         import zenoh  # here, so that in-process runs do without it
+
+        from shared.session import open_session
 
         self._world = world
         self._zenoh = zenoh
@@ -131,7 +134,7 @@ class ZenohBus:
         if not listen and endpoint.endswith(":0"):
             raise SaccadeError(f"bus at {endpoint}: port 0 is for the launcher only; name the port of a running bus")
         timeout_s = timeout_s or float(os.environ.get(ROUTER_WAIT_VARIABLE, ROUTER_S))
-        self._session = _open(zenoh, endpoint, listen, timeout_s)
+        self._session = open_session(endpoint, listen=listen, onlooker=onlooker, timeout_s=timeout_s)
 
     def publish(self, topic: Topic, part: str | None, payload: bytes) -> None:
         """Blocks while the network is congested: in lockstep a lost message would stop the world."""
@@ -223,7 +226,8 @@ class ZenohBus:
         self._questions.put(None)
         for entity in (*self._subscribers, *self._tokens, *self._queryables, *self._publishers.values()):
             entity.undeclare()
-        self._session.close()
+        with contextlib.suppress(self._zenoh.ZError):  # someone it was connected to is suspended: not waited for
+            self._session.close()
 
 
 def free_endpoint(endpoint: str) -> str:
@@ -238,54 +242,3 @@ def free_endpoint(endpoint: str) -> str:
             return f"{match[1]}/{match[2]}:{probe.getsockname()[1]}"
     except OSError as error:
         raise SaccadeError(f"bus at {endpoint}: cannot listen there: {error.strerror or error}") from error
-
-
-def _open(zenoh, endpoint: str, listen: bool, timeout_s: float):
-    file = os.environ.get(CONFIG_VARIABLE)
-    try:
-        config = zenoh.Config.from_file(file) if file else zenoh.Config()
-    except zenoh.ZError as error:
-        raise SaccadeError(f"{CONFIG_VARIABLE}={file}: no configuration of Zenoh's: {str(error).split(' at /')[0]}"
-                           ) from error
-    settings = {
-        "mode": "router" if listen else "client",
-        "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": False,
-        "scouting/delay": 0,
-        "transport/link/rx/max_message_size": 2 * MAX_BYTES,
-    }
-    if not listen:
-        settings |= {"connect/timeout_ms": int(timeout_s * 1000), "connect/exit_on_failure": True,
-                     "connect/endpoints": [endpoint]}
-    else:
-        settings["listen/endpoints"] = [endpoint]
-    try:
-        for key, value in settings.items():
-            config.insert_json5(key, json.dumps(value))
-        return zenoh.open(config)
-    except zenoh.ZError as error:
-        raise SaccadeError(_explain(endpoint, listen, timeout_s, str(error))) from error
-
-
-def _explain(endpoint: str, listen: bool, timeout_s: float, error: str) -> str:
-    if "in use" in error:
-        return f"bus at {endpoint}: the port is in use; choose another, or port 0 for a free one"
-    if "Endpoints must be" in error or ("protocol" in error.lower() and "supported" in error):
-        return f"bus endpoint {endpoint!r} is not an address such as tcp/127.0.0.1:7447"
-    reason = error.split(" at /")[0]
-    if listen:
-        return f"bus at {endpoint}: cannot listen there: {reason}"
-    if _is_open(endpoint):
-        return (f"bus at {endpoint} is there, but does not let this one in: are the password, the certificates and the "
-                f"protocol right ({CONFIG_VARIABLE}={os.environ.get(CONFIG_VARIABLE, 'not set')})?")
-    return f"bus at {endpoint} does not answer within {timeout_s:g} s; is it running? ({reason})"
-
-
-def _is_open(endpoint: str) -> bool:
-    """Whether something listens there."""
-    match = re.fullmatch(r"\w+/(\[[0-9a-fA-F:]+\]|[^\[\]:]+):(\d+)", endpoint)
-    if match is None:
-        return False
-    with contextlib.suppress(OSError, ValueError), socket.create_connection((match[1].strip("[]"), int(match[2])), 1.0):
-        return True
-    return False

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import queue
-from contextlib import closing
+import signal
+import subprocess
+import sys
+from contextlib import closing, suppress
 
 import pytest
 
@@ -129,3 +132,43 @@ def test_closing_twice_and_publishing_afterwards_is_harmless(pair):
     pair.a.close()
     pair.a.close()
     pair.a.publish(ACTION, None, b"too late")
+
+
+LOOKS_ON = """
+import sys, time
+from shared.bus import ZenohBus
+from shared.topics import FRAME
+bus = ZenohBus(sys.argv[1], world="test", onlooker=True)
+bus.subscribe((FRAME,), lambda *item: None)
+bus.join("there", "it", lambda members: None)
+time.sleep(600)
+"""
+
+
+def test_one_who_looks_on_and_is_suspended_holds_nobody_up():
+    """Its share is dropped; the others get everything. Of a service that takes nothing the router would let go after
+    some seconds of waiting: this one is still there."""
+    endpoint = free_endpoint("tcp/127.0.0.1:0")
+    payload, count = bytes(480 * 480 * 3), 300  # more than is held on the way
+    looking = subprocess.Popen([sys.executable, "-c", LOOKS_ON, endpoint])
+    try:
+        with (closing(ZenohBus(endpoint, world="test", listen=True)), closing(ZenohBus(endpoint, world="test")) as bus,
+              closing(ZenohBus(endpoint, world="test")) as other):
+            met, arrived = queue.SimpleQueue(), queue.SimpleQueue()
+            bus.join("there", "me", met.put)
+            other.subscribe((FRAME,), lambda topic, *_: arrived.put(topic))
+            other.join("there", "other", lambda members: None)
+            while not {"it", "other"} <= (members := met.get(timeout=WAIT_S)):
+                pass
+            looking.send_signal(signal.SIGSTOP)
+            for _ in range(count):
+                bus.publish(FRAME, None, payload)
+            assert [arrived.get(timeout=WAIT_S) for _ in range(count)] == [FRAME] * count
+            with suppress(queue.Empty):
+                while True:
+                    members = met.get(timeout=1.0)
+            looking.kill()
+            assert "it" in members
+    finally:
+        looking.kill()
+        looking.wait()

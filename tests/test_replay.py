@@ -24,7 +24,7 @@ from shared.wire import encode
 from tests.fixtures.make import GOLDEN, IN_WORDS, WORDS, changes, in_words
 from tests.samples import sample
 
-FORMAT_1 = GOLDEN.with_name("format_1.mcap")
+FORMAT_1, FORMAT_2 = GOLDEN.with_name("format_1.mcap"), GOLDEN.with_name("format_2.mcap")
 WAIT_S = 300
 
 
@@ -64,6 +64,16 @@ def test_the_oldest_format_still_replays_to_the_byte(tmp_path):
     assert missing(tmp_path / "replay" / "run.mcap").complete
     again = {(name, p) for name, p, _ in messages(tmp_path / "replay" / "run.mcap", *IN_WORDS)}
     assert again == {(name, p) for name, p, _ in messages(FORMAT_1, *IN_WORDS)}
+
+
+def test_what_a_format_did_not_have_is_no_difference(tmp_path):
+    """Format 2 had neither masks nor candidates; all else is compared."""
+    assert RunReader(FORMAT_2).format == 2
+    assert {m.mask_bits is None for t, _, m in RunReader(FORMAT_2) if t == PERCEPT} == {True}
+    done = saccade(FORMAT_2, "--into", "perception,belief,planner", "--check", "--bus", "local", "--out",
+                   tmp_path / "replay")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "0 beyond what is tolerated" in done.stdout
 
 
 def test_on_the_bus_as_in_one_process_nothing_is_lost(tmp_path):

@@ -10,27 +10,31 @@ import subprocess
 import sys
 import time
 from contextlib import contextmanager
+from http.client import HTTPConnection
 from pathlib import Path
-from urllib.parse import urlsplit
+from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 import pytest
 from PIL import Image
 from playwright.sync_api import sync_playwright
 
-from services.viewer.server import binary, free_port
+from services.viewer.server import binary, free_port, listens
 from shared.config import REPOSITORY
 from tests.fixtures.make import GOLDEN
 from tests.test_viewer import Seen
 
 ARTEFACTS = REPOSITORY / "artefacts"
 WAIT_S = 120
+ENOUGH_BYTES = 500_000  # more than ten steps
 FLAGS = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 SIZE = {"width": 1400, "height": 860}
 # left, top, right and bottom of what the layout puts there, as shares of the page
 PLACES = {"world": (0.02, 0.10, 0.48, 0.75), "camera": (0.51, 0.09, 0.66, 0.32), "goal": (0.68, 0.09, 0.82, 0.32),
           "crops": (0.55, 0.37, 0.95, 0.50), "distance": (0.52, 0.56, 0.74, 0.72), "entropy": (0.78, 0.56, 0.98, 0.72),
           "decisions": (0.02, 0.85, 0.45, 0.95)}
+ENTITIES = ("/world/path", "/world/candidates", "/world/viewpoint/imagined", "/world/true", "/goal/image", "/F", "/G",
+            "/entropy", "/presence", "/distance/true", "/decisions", "/milliseconds/perception")
 MOVES = ("world", "camera", "distance", "decisions")
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
@@ -55,6 +59,30 @@ def saccade(*arguments: object):
     finally:
         child.send_signal(signal.SIGINT)
         child.communicate(timeout=WAIT_S)
+
+
+def until(done) -> bool:
+    end_s = time.monotonic() + WAIT_S
+    while not done() and time.monotonic() < end_s:
+        time.sleep(0.2)
+    return done()
+
+
+def data_port_of(port: int) -> int:
+    """Where the page at this port has its data from."""
+    door = HTTPConnection("127.0.0.1", port, timeout=WAIT_S)
+    door.request("GET", "/")
+    data, = parse_qs(urlsplit(door.getresponse().headers["Location"]).query)["url"]
+    return urlsplit(data).port
+
+
+def recorded(data_port: int, path: Path) -> Path:
+    """What somebody who comes now is shown, for a while."""
+    with subprocess.Popen([binary(), "--save", path, f"rerun+http://127.0.0.1:{data_port}/proxy"],
+                          stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as other:
+        assert until(lambda: path.exists() and path.stat().st_size > ENOUGH_BYTES)
+        other.send_signal(signal.SIGINT)
+    return path
 
 
 class Page:
@@ -107,7 +135,7 @@ def share_unlike_background(pixels: np.ndarray) -> float:
 def test_a_running_episode_is_seen_and_moves(browser, tmp_path):
     """World, images, curves and words have content that changes from step to step; nobody else is heard of; who comes
     late sees the run from its start."""
-    port, data_port = free_port("127.0.0.1"), free_port("127.0.0.1")
+    port, data_port, another = (free_port("127.0.0.1") for _ in range(3))
     ARTEFACTS.mkdir(exist_ok=True)
     with saccade("run", "--view", "--plain", "--count", "50", "--seed", "5", "--set", f"viewer.port={port}", "--set",
                  f"viewer.data_port={data_port}", "--set", "viewer.truth=true", "--out", tmp_path / "run") as run:
@@ -117,20 +145,15 @@ def test_a_running_episode_is_seen_and_moves(browser, tmp_path):
         page.shot(ARTEFACTS / "viewer_live.png")
         assert run.poll() is None  # that was while it ran
         assert page.answered == {"127.0.0.1"}
-        late = tmp_path / "late.rrd"
-        with subprocess.Popen([binary(), "--save", late, f"rerun+http://127.0.0.1:{data_port}/proxy"],
-                              stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as other:
-            end_s = time.monotonic() + WAIT_S
-            while not (late.exists() and late.stat().st_size > 500_000) and time.monotonic() < end_s:
-                time.sleep(0.2)
-            other.send_signal(signal.SIGINT)
         page.page.close()
-    seen = Seen(late)
-    steps = list(seen.of("/world/camera/image", "EncodedImage:blob"))
-    assert steps[:5] == [0, 1, 2, 3, 4]
-    for entity in ("/world/path", "/world/candidates", "/world/viewpoint/imagined", "/world/true", "/goal/image", "/F",
-                   "/G", "/entropy", "/presence", "/distance/true", "/decisions", "/milliseconds/perception"):
-        assert seen.entities[entity], entity
+        late = recorded(data_port, tmp_path / "late.rrd")
+        with saccade("view", "--live", "--truth", "--run", tmp_path / "run", "--port", another):
+            assert until(lambda: listens("127.0.0.1", another))
+            later = recorded(data_port_of(another), tmp_path / "later.rrd")
+        assert run.poll() is None
+    for seen in (Seen(late), Seen(later)):
+        assert list(seen.of("/world/camera/image", "EncodedImage:blob"))[:5] == [0, 1, 2, 3, 4]
+        assert not {entity for entity in ENTITIES if not seen.entities[entity]}
 
 
 def test_a_log_is_seen(browser):

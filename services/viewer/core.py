@@ -68,7 +68,7 @@ class Viewer:
         self._show[topic](settle(message))
 
     def dropped(self, count: int) -> None:
-        """So many messages came faster than they could be shown."""
+        """So many messages came faster than they could be shown, so far."""
         self._curves.dropped("viewer", count)
 
     def close(self) -> list[str]:

@@ -25,6 +25,7 @@ from shared.wire import MessageError, decode
 NAME = "viewer"
 QUEUE_BYTES = 64 * 1024 * 1024  # of messages that wait to be shown; what does not fit is dropped and counted
 TICK_S = 0.5
+WAITED_FOR = 10_000  # messages that may still come out of their turn
 BATCH_S = 0.5  # of what is sent to browsers: each batch costs them a drawing
 
 
@@ -36,7 +37,8 @@ def main(argv: Sequence[str] | None = None) -> None:
 def _work(config: Config, folder: Path, inbox: Inbox) -> None:
     step_back()
     health = Health(NAME, at=(config.run or folder.name, 0, 0))
-    with (Server(config.viewer) as server, closing(ZenohBus(config.bus.endpoint, world=config.bus.world)) as bus,
+    with (Server(config.viewer) as server,
+          closing(ZenohBus(config.bus.endpoint, world=config.bus.world, onlooker=True)) as bus,
           Heartbeat(bus, health, inbox.stop)):
         watch(bus, server, config, inbox, health)
 
@@ -70,7 +72,6 @@ def watch(bus: Bus, server: Server, config: Config, inbox: Inbox, health: Health
                 raise SaccadeError("viewer: Rerun's server has ended")
             if item is not None:
                 feed.take(*item)
-            feed.note_dropped(inbox.dropped)
         return feed.viewer.close()
 
 
@@ -95,12 +96,17 @@ class _Feed:
         self._health.received += 1
         with suppress(MessageError):  # whoever works with it counts it
             message = decode(topic.type, payload)
-            if self._sequences.take(topic, part, message) is not None:
-                self.viewer.take(topic, part, message)
-                self._health.at = (message.run, message.episode, message.step)
+            lost = self._sequences.take(topic, part, message)
+            if lost is None:
+                return
+            if lost:
+                self._note_lost(lost)
+            self.viewer.take(topic, part, message)
+            self._health.at = (message.run, message.episode, message.step)
 
-    def note_dropped(self, count: int) -> None:
-        """So many came while the inbox was full."""
-        if count > self._health.skipped:
-            self._health.skipped = count
-            self.viewer.dropped(count)
+    def _note_lost(self, lost: int) -> None:
+        """So many did not come in their turn: they came faster than this process could take them."""
+        self._health.gaps += lost
+        self.viewer.dropped(self._health.gaps)
+        if sum(self._sequences.missing.values()) > WAITED_FOR:
+            self._sequences = Sequences()
