@@ -7,7 +7,7 @@ pose is moved to where the camera would be, drawn, and put where its belief woul
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from services.viewer.layout import VIEW_PX
 from shared.drawing import LatentDecoder
@@ -20,6 +20,13 @@ from shared.windows import CROP_PX, Window
 Image = NDArray[np.uint8]
 
 DARK = 24  # of 255: darker than this, a drawn crop is its black background
+
+
+def ring_of(window: Window, intrinsics_px: ArrayLike, up: ArrayLike) -> NDArray[np.float64]:
+    """Once round the frame of a window's only crop in the image [5, 2], pixels."""
+    corners = window.pixels_of(2, intrinsics_px, up)[0]
+    middle, reach = corners.mean((0, 1)), 2.0  # from the centres of 2x2 cells to the corners
+    return middle + reach * (corners.reshape(4, 2)[[0, 1, 3, 2, 0]] - middle)
 
 
 class Imagination:
@@ -37,10 +44,7 @@ class Imagination:
 
     def frame_of(self, percept: Percept) -> NDArray[np.float64]:
         """The frame of an object's crop in the image, once round [5, 2], pixels."""
-        up = percept.world_from_camera[2, :3]
-        corners = self.window([percept]).pixels_of(2, percept.intrinsics_px, up)[0]
-        middle, reach = corners.mean((0, 1)), 2.0  # from the centres of 2x2 cells to the corners
-        return middle + reach * (corners.reshape(4, 2)[[0, 1, 3, 2, 0]] - middle)
+        return ring_of(self.window([percept]), percept.intrinsics_px, percept.world_from_camera[2, :3])
 
     def crops(self, frame: Frame, percepts: list[Percept]) -> Image:
         """What the networks look at [K, 64, 64, 3]; black beyond the image."""
@@ -64,17 +68,19 @@ class Imagination:
         order = [k for k in np.argsort(-depth) if depth[k] > 0 and beliefs[k].object in seen]  # the nearest last
         crops = self._draw({beliefs[k].object: self._moved(viewpoint, beliefs[k], seen[beliefs[k].object])
                             for k in order})
-        grid = np.stack(np.meshgrid(*[np.arange(VIEW_PX) + 0.5] * 2), axis=-1).reshape(-1, 2)
         for k, crop in zip(order, crops, strict=True):
             away = np.linalg.norm(beliefs[k].mean_m - viewpoint[:3, 3])
             window = Window(center[k:k + 1], np.array([REFERENCE_RANGE_M / away]),
                             np.array([self.cards[beliefs[k].object].crop_side_m]))
-            at = window.crop_of(grid, intrinsics, viewpoint[2, :3])[0]
-            inside = (np.abs(at) < 1).all(axis=1)  # what is nowhere is not inside
-            column, row = ((at[inside] + 1) / 2 * CROP_PX).astype(np.int64).T
+            ring = ring_of(window, intrinsics, viewpoint[2, :3]).clip(0, VIEW_PX)
+            (left, top), (right, bottom) = np.floor(ring.min(0)).astype(int), np.ceil(ring.max(0)).astype(int)
+            grid = np.stack(np.meshgrid(np.arange(left, right), np.arange(top, bottom)), axis=-1)
+            at = window.crop_of(grid.reshape(-1, 2) + 0.5, intrinsics, viewpoint[2, :3])[0].reshape(grid.shape)
+            inside = (np.abs(at) < 1).all(axis=-1)  # what is nowhere is not inside
+            column, row = (np.where(inside[..., None], at + 1, 0) / 2 * CROP_PX).astype(np.int64).transpose(2, 0, 1)
             drawn = crop[row, column]
-            rows = np.flatnonzero(inside)[drawn.max(axis=1) > DARK]
-            view.reshape(-1, 3)[rows] = drawn[drawn.max(axis=1) > DARK]
+            shown = inside & (drawn.max(axis=-1) > DARK)
+            view[top:bottom, left:right][shown] = drawn[shown]
         return view
 
     def _moved(self, viewpoint: NDArray[np.float64], belief: Belief, seen: Percept) -> NDArray[np.float32]:

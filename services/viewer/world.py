@@ -32,6 +32,7 @@ class World:
                  sizes_m: dict[str, NDArray[np.float64]]) -> None:
         self._to, self._colour_of, self._sizes_m = recording, colour_of, sizes_m
         self._path: deque[NDArray[np.float64]] = deque(maxlen=PATH_LENGTH)
+        self._looks: dict[str, object] = {}  # of each path, what is logged only when it changes
         self._to.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         side = (UPPER_M - LOWER_M)[:2]
         self._to.log("world/table", rr.Boxes3D(centers=[(0, 0, -0.006)], sizes=[(*side, 0.01)], colors=[TABLE],
@@ -40,6 +41,7 @@ class World:
     def begin(self) -> None:
         """Another episode: nothing is there yet."""
         self._path.clear()
+        self._looks.clear()
         for path in OF_EPISODE:
             self._to.log(path, rr.Clear(recursive=True))
 
@@ -53,17 +55,24 @@ class World:
     def belief(self, belief: Belief) -> None:
         """Particles; within the ellipsoid the object is with probability 0.95."""
         path, colour = f"world/objects/{rr.escape_entity_path_part(belief.object)}", self._colour_of(belief.object)
-        faded = [round(UNSEEN_GREY + (part - UNSEEN_GREY) * (0.2 + 0.8 * belief.presence)) for part in colour]
-        self._to.log(f"{path}/particles", rr.Points3D(belief.particles_m, colors=[faded], radii=PARTICLE_M))
-        if belief.presence < SEEN:
-            self._to.log(f"{path}/belief", rr.Clear(recursive=False))
+        share = 0.2 + 0.8 * round(8 * belief.presence) / 8
+        faded = [round(UNSEEN_GREY + (part - UNSEEN_GREY) * share) for part in colour]
+        cloud = rr.Points3D.from_fields(positions=belief.particles_m)
+        if self._changed(f"{path}/particles", share):
+            cloud = rr.Points3D(belief.particles_m, colors=[faded], radii=PARTICLE_M)
+        self._to.log(f"{path}/particles", cloud)
+        seen = belief.presence >= SEEN
+        appears = self._changed(f"{path}/belief", seen)
+        if not seen:
+            if appears:
+                self._to.log(f"{path}/belief", rr.Clear(recursive=False))
             return
         values, vectors = np.linalg.eigh(belief.covariance_m2)
         vectors[:, 0] *= np.sign(np.linalg.det(vectors))
-        self._to.log(f"{path}/belief", rr.Ellipsoids3D(
+        look = {"colors": [colour], "labels": [plain(belief.object)], "show_labels": True} if appears else {}
+        self._to.log(f"{path}/belief", rr.Ellipsoids3D.from_fields(
             centers=[belief.mean_m], half_sizes=[CHI_95 * np.sqrt(np.maximum(values, 1e-8))],
-            quaternions=[rr.Quaternion(xyzw=quaternion(vectors))], colors=[colour], labels=[plain(belief.object)],
-            show_labels=True))
+            quaternions=[rr.Quaternion(xyzw=quaternion(vectors))], **look))
 
     def plan(self, plan: Plan, size_px: int) -> None:
         """The best candidates, the best one green, and the chosen viewpoint. `size_px`: side of the image that is
@@ -93,6 +102,11 @@ class World:
         self._to.log(path, rr.Transform3D(translation=world_from_camera[:3, 3], mat3x3=world_from_camera[:3, :3]),
                      rr.Pinhole(focal_length=(fx, fy), principal_point=(cx, cy), resolution=size_px, color=colour,
                                 camera_xyz=rr.ViewCoordinates.RUB, image_plane_distance=distance_m))
+
+    def _changed(self, path: str, look: object) -> bool:
+        before = self._looks.get(path)
+        self._looks[path] = look
+        return before != look
 
 
 def quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
