@@ -67,6 +67,7 @@ def watch(bus: Bus, server: Server, config: Config, inbox: Inbox, health: Health
         health.say(state="ready", note=server.url)
         for kept in sorted(past, key=lambda kept: kept.published_ns):
             feed.take(kept.topic, kept.part, kept.payload)
+        past.clear()  # it may be hundreds of megabytes
         for item in inbox.items(tick_s=TICK_S):
             if not server.running:
                 raise SaccadeError("viewer: Rerun's server has ended")
