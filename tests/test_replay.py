@@ -68,8 +68,9 @@ def test_the_oldest_format_still_replays_to_the_byte(tmp_path):
 
 def test_what_a_format_did_not_have_is_no_difference(tmp_path):
     """Format 2 had neither masks nor candidates; all else is compared."""
-    assert RunReader(FORMAT_2).format == 2
-    assert {m.mask_bits is None for t, _, m in RunReader(FORMAT_2) if t == PERCEPT} == {True}
+    reader = RunReader(FORMAT_2)
+    assert {m.mask_bits is None for t, _, m in reader if t == PERCEPT} == {True}
+    assert reader.format == 2
     done = saccade(FORMAT_2, "--into", "perception,belief,planner", "--check", "--bus", "local", "--out",
                    tmp_path / "replay")
     assert done.returncode == 0, done.stdout + done.stderr

@@ -33,7 +33,7 @@ SIZE = {"width": 1400, "height": 860}
 PLACES = {"world": (0.02, 0.10, 0.48, 0.75), "camera": (0.51, 0.09, 0.66, 0.32), "goal": (0.68, 0.09, 0.82, 0.32),
           "crops": (0.55, 0.37, 0.95, 0.50), "distance": (0.52, 0.56, 0.74, 0.72), "entropy": (0.78, 0.56, 0.98, 0.72),
           "decisions": (0.02, 0.85, 0.45, 0.95)}
-TITLES = (0.05, 0.065)  # from top to bottom, where a view that cannot be drawn has a red sign
+TITLES = (0.0, 0.05, 1.0, 0.065)  # where a view that cannot be drawn has a red sign
 ENTITIES = ("/world/path", "/world/candidates", "/world/viewpoint/imagined", "/world/true", "/goal/image", "/F", "/G",
             "/entropy", "/presence", "/distance/true", "/decisions", "/milliseconds/perception")
 MOVES = ("world", "camera", "distance", "decisions")
@@ -107,10 +107,8 @@ class Page:
         data = self.page.screenshot(path=path)
         pixels = np.asarray(Image.open(io.BytesIO(data)).convert("RGB")).astype(np.int16)
         height, width = pixels.shape[:2]
-        titles = pixels[int(TITLES[0] * height):int(TITLES[1] * height)]
-        assert not ((titles[..., 0] > 180) & (titles[..., 1:] < 110).all(-1)).any(), "a view complains"
         return {name: pixels[int(t * height):int(b * height), int(x * width):int(r * width)]
-                for name, (x, t, r, b) in PLACES.items()}
+                for name, (x, t, r, b) in (PLACES | {"titles": TITLES}).items()}
 
     def until(self, wanted) -> dict[str, np.ndarray]:
         """The first shot of which `wanted(shot)` names nothing that lacks."""
@@ -125,8 +123,10 @@ class Page:
 
 
 def empty(shot: dict[str, np.ndarray]) -> list[str]:
-    """Places without content: of one colour, or nearly."""
-    return [name for name, pixels in shot.items() if share_unlike_background(pixels) < 0.002]
+    """Places without content, of one colour or nearly; and the titles, while a view says that it cannot be drawn."""
+    signs = (shot["titles"][..., 0] > 180) & (shot["titles"][..., 1:] < 110).all(-1)
+    nothing = [name for name, pixels in shot.items() if share_unlike_background(pixels) < 0.002]
+    return nothing + ["titles"] * bool(signs.any())
 
 
 def share_unlike_background(pixels: np.ndarray) -> float:
