@@ -19,7 +19,7 @@ from services.viewer.core import Viewer
 from services.viewer.live import QUEUE_BYTES, connected, step_back, watch
 from services.viewer.server import Server, with_free_ports
 from shared.bus import ZenohBus
-from shared.config import Config, load, validate
+from shared.config import Config, ViewerConfig, load, validate
 from shared.errors import SaccadeError
 from shared.process import Health, Inbox
 from shared.topics import GOAL_PERCEPT
@@ -78,7 +78,11 @@ def stay(running: Callable[[], bool]) -> None:
 
 
 def _ports(config: Config, port: int | None) -> Config:
-    return with_free_ports(config) if port is None else config.with_values({"viewer.port": port})
+    """Ports of its own: those of the configuration are taken by the run's viewer."""
+    own = ViewerConfig()
+    config = config.with_values({"viewer.address": own.address, "viewer.port": port or own.port,
+                                 "viewer.data_port": own.data_port})
+    return with_free_ports(config) if port is None else config
 
 
 def _with_weights(config: Config, weights: Path | None) -> Config:

@@ -26,7 +26,7 @@ from tests.test_viewer import Seen
 
 ARTEFACTS = REPOSITORY / "artefacts"
 WAIT_S = 120
-ENOUGH_BYTES = 500_000  # more than ten steps
+ENOUGH_BYTES, CATCH_UP_S = 500_000, 8.0
 FLAGS = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 SIZE = {"width": 1400, "height": 860}
 # left, top, right and bottom of what the layout puts there, as shares of the page
@@ -82,6 +82,7 @@ def recorded(data_port: int, path: Path) -> Path:
     with subprocess.Popen([binary(), "--save", path, f"rerun+http://127.0.0.1:{data_port}/proxy"],
                           stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as other:
         assert until(lambda: path.exists() and path.stat().st_size > ENOUGH_BYTES)
+        time.sleep(CATCH_UP_S)  # it comes entity by entity
         other.send_signal(signal.SIGINT)
     return path
 
@@ -144,16 +145,15 @@ def test_a_running_episode_is_seen_and_moves(browser, tmp_path):
                  f"viewer.data_port={data_port}", "--set", "viewer.truth=true", "--out", tmp_path / "run") as run:
         page = Page(browser, port)
         first = page.until(empty)
+        with saccade("view", "--live", "--truth", "--run", tmp_path / "run", "--port", another):
+            assert until(lambda: listens("127.0.0.1", another))
+            later = recorded(data_port_of(another), tmp_path / "later.rrd")
         page.until(lambda shot: [name for name in MOVES if np.abs(shot[name] - first[name]).max() < 48])
         page.shot(ARTEFACTS / "viewer_live.png")
         assert run.poll() is None  # that was while it ran
         assert page.answered == {"127.0.0.1"}
         page.page.close()
         late = recorded(data_port, tmp_path / "late.rrd")
-        with saccade("view", "--live", "--truth", "--run", tmp_path / "run", "--port", another):
-            assert until(lambda: listens("127.0.0.1", another))
-            later = recorded(data_port_of(another), tmp_path / "later.rrd")
-        assert run.poll() is None
     for seen in (Seen(late), Seen(later)):
         assert list(seen.of("/world/camera/image", "EncodedImage:blob"))[:5] == [0, 1, 2, 3, 4]
         assert not {entity for entity in ENTITIES if not seen.entities[entity]}
