@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import signal
 import threading
@@ -75,9 +76,13 @@ def _on_ray(function: Callable[..., Any], work: Work, cluster: str) -> Results:
         raise SaccadeError("--cluster needs Ray: pip install 'saccade[cluster]'") from error
     names = [name for name in ("MUJOCO_GL", "SACCADE_YCB") if name in os.environ]
     environment = dict.fromkeys(VARIABLES, "1") | {name: os.environ[name] for name in names}
+    join = functools.partial(ray.init, cluster, log_to_driver=False, logging_level="ERROR",
+                             runtime_env={"env_vars": environment | {"PYTHONPATH": str(REPOSITORY)}})
     try:
-        ray.init(cluster, log_to_driver=False, logging_level="ERROR",
-                 runtime_env={"env_vars": environment | {"PYTHONPATH": str(REPOSITORY)}})
+        try:
+            join()
+        except ConnectionAbortedError:  # it is there, but was too slow to make room
+            join()
     except (ConnectionError, ValueError, RuntimeError) as error:
         raise SaccadeError(f"no Ray cluster answers at {cluster}: {str(error).strip().splitlines()[-1]}") from error
     try:
