@@ -29,6 +29,7 @@ from shared.reading import RunReader
 from shared.topics import BELIEF, FRAME, GOAL, PERCEPT, PLAN, RESULT, STATUS, TRUTH
 from tests.fakes.camera import LENS_PX, film, folder_of, written
 from tests.fakes.camera import line as pose_line
+from tests.fakes.logs import so_far
 from tests.front_door import call
 from tests.samples import sample
 
@@ -127,8 +128,8 @@ def test_ctrl_c_ends_a_run_with_its_log_and_its_picture(filmed, tmp_path):
         env={**os.environ, "PYTHONPATH": str(REPOSITORY)}, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     try:
         end = time.monotonic() + WAIT_S
-        while time.monotonic() < end and not ((out / "run.mcap").is_file() and any(
-                topic == FRAME and message.step > VIEWS for topic, _, message in RunReader(out / "run.mcap"))):
+        while time.monotonic() < end and not any(
+                topic == FRAME and message.step > VIEWS for topic, _, message in so_far(out / "run.mcap")):
             time.sleep(0.2)
         process.send_signal(signal.SIGINT)
         text, errors = process.communicate(timeout=WAIT_S)

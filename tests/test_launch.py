@@ -24,6 +24,7 @@ from shared.messages import Status
 from shared.reading import RunReader
 from shared.topics import FRAME, RESULT, STATUS
 from tests.fakes.launch import FAKES, PARTS, configuration, processes_of
+from tests.fakes.logs import so_far
 from tests.fakes.services import pairs
 
 WAIT_S = 60
@@ -142,7 +143,7 @@ def test_an_interrupted_launcher_leaves_no_process_and_a_readable_log(tmp_path, 
                                 stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
     try:
         log = run_dir / "run.mcap"
-        assert until(lambda: log.exists() and any(t == FRAME for t, _, _ in RunReader(log)))
+        assert until(lambda: any(t == FRAME for t, _, _ in so_far(log)))
         assert len(processes_of(run_dir)) == len(PROCESSES)
         os.kill(launcher.pid, number)
         launcher.wait(WAIT_S)

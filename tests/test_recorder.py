@@ -22,6 +22,7 @@ from shared.reading import RunReader
 from shared.recording import RunLog
 from shared.topics import ACTION, GOAL, PERCEPT, RESULT, STATUS
 from shared.wire import encode
+from tests.fakes.logs import so_far
 from tests.samples import sample
 
 WAIT_S = 60
@@ -57,6 +58,11 @@ class RecorderProcess:
         self.process.kill()
         self.process.communicate()
         self.bus.close()
+
+
+def steps_in(folder: Path) -> list[int]:
+    """Of the actions that have reached the disk."""
+    return [message.step for topic, _, message in so_far(folder / "run.mcap") if topic == ACTION]
 
 
 def test_a_killed_recorder_loses_at_most_a_second(tmp_path):
@@ -103,9 +109,8 @@ def test_a_recorder_that_is_started_again_goes_on_with_its_log(tmp_path):
         with closing(RecorderProcess(folder)) as recorder:
             for seq in range(first, first + 5):
                 recorder.bus.publish(ACTION, None, encode(sample(ACTION.type, run="run", step=seq, seq=seq)))
-            time.sleep(1.0)  # longer than it takes to reach the disk
-    steps = [m.step for t, _, m in RunReader(folder / "run.mcap") if t == ACTION]
-    assert steps == [*range(5), *range(10, 15)]
+            recorder.until(lambda last=seq: last in steps_in(folder))
+    assert steps_in(folder) == [*range(5), *range(10, 15)]
     assert [path.name for path in folder.glob("*.mcap")] == ["run.mcap"]
 
 
@@ -149,8 +154,8 @@ def test_what_was_lost_stands_in_the_log_before_what_told_of_it(tmp_path):
             outbox.keep(ACTION, None, message, encode(message))
             if seq != 1:
                 recorder.bus.publish(ACTION, None, encode(message))
-        time.sleep(1.0)  # longer than it takes to reach the disk
-    assert [m.seq for t, _, m in RunReader(tmp_path / "run" / "run.mcap") if t == ACTION] == [0, 1, 2]
+        recorder.until(lambda: 2 in steps_in(tmp_path / "run"))
+    assert steps_in(tmp_path / "run") == [0, 1, 2]
 
 
 def test_what_holds_for_an_episode_and_was_lost_is_asked_for_when_it_ends(tmp_path):
@@ -161,8 +166,8 @@ def test_what_holds_for_an_episode_and_was_lost_is_asked_for_when_it_ends(tmp_pa
             message = sample(topic.type, run="run", episode=0, step=0, seq=0)
             outbox.keep(topic, None, message, encode(message))
         recorder.bus.publish(RESULT, None, encode(message))
-        time.sleep(1.0)  # longer than it takes to reach the disk
-    assert {t for t, _, _ in RunReader(tmp_path / "run" / "run.mcap")} >= {GOAL, RESULT}
+        recorder.until(lambda: RESULT in {t for t, _, _ in so_far(tmp_path / "run" / "run.mcap")})
+    assert GOAL in {t for t, _, _ in RunReader(tmp_path / "run" / "run.mcap")}
 
 
 def test_a_recorder_without_room_says_so_and_the_bus_goes_on(tmp_path):

@@ -6,7 +6,9 @@ import math
 
 import numpy as np
 
+from shared.errors import SaccadeError
 from shared.geometry import look_at
+from shared.reading import RunReader
 from shared.recording import RunLog
 from shared.topics import BELIEF, FRAME, GOAL, PERCEPT, PLAN, RESULT, STATUS, TRUTH
 from shared.wire import encode
@@ -53,6 +55,14 @@ def story(episodes=2, steps=3):
             yield new(PLAN, step, viewpoint=camera_at(step + 1, episode),
                       believed_distance_m=-1.0 if step == 0 else 0.2)
     yield STATUS, "planner", sample(STATUS.type, run="r", episode=0, step=0, service="planner", milliseconds=7.5)
+
+
+def so_far(log):
+    """(topic, part, message) of a log that is being written; none before it has begun."""
+    try:
+        return list(RunReader(log))
+    except SaccadeError:
+        return []
 
 
 def write(path, messages, *, configuration="{}"):
