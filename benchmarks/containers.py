@@ -7,7 +7,6 @@ import json
 import math
 import os
 import subprocess
-import sys
 import tempfile
 import time
 from functools import partial
@@ -18,6 +17,7 @@ import yaml
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.rounds import in_turn
 from services.perception.core import SceneCCN
 from services.simulator.objects import names_of
 from shared.config import REPOSITORY
@@ -32,7 +32,8 @@ PROJECT = f"saccade-bench-{os.getpid()}"
 
 
 def compose(*arguments: str) -> None:
-    environment = {**os.environ, "SACCADE_COUNT": str(SCENES), "SACCADE_SEED": "3", "SACCADE_PORT": "0"}
+    environment = {**os.environ, "SACCADE_COUNT": str(SCENES), "SACCADE_SEED": "3", "SACCADE_PORT": "0",
+                   "SACCADE_VIEW_S": "0"}
     subprocess.run(["docker", "compose", "-p", PROJECT, *arguments], cwd=REPOSITORY, env=environment, check=True,
                    stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
@@ -74,15 +75,12 @@ def without_shared_memory(folder: Path) -> str:
 def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         alone = ("compose.yaml", without_shared_memory(Path(folder)))
-        ways = [(f"{n} x perception", partial(run, n)) for n in REPLICAS]
-        ways.append(("1 x perception, no shared memory", partial(run, 1, alone)))
+        ways = {f"{n} x perception": partial(run, n) for n in REPLICAS}
+        ways["1 x perception, no shared memory"] = partial(run, 1, alone)
         compose("build")
-        found = {name: [] for name, _ in ways}
-        for number in range(ROUNDS):
-            for name, measure in ways[number % len(ways):] + ways[:number % len(ways)]:
-                found[name].append(measure())
+        found = in_turn(ways, ROUNDS)
     rates = {name: float(np.median(values)) for name, values in found.items()}
-    first, objects = ways[0][0], len(names_of("pantry"))
+    first, objects = next(iter(ways)), len(names_of("pantry"))
     alone_ms = {k: perception_ms(k) for k in sorted({math.ceil(objects / n) for n in REPLICAS})}
     table = Table("way", "steps per s", "of the first", "objects each", "perception, ms", "projected: a core each")
     for (name, rate), replicas in zip(rates.items(), (*REPLICAS, 1), strict=True):
@@ -91,8 +89,6 @@ def main() -> None:
         table.add_row(name, f"{rate:.2f}", f"{rate / rates[first]:.3f}", str(share), f"{alone_ms[share]:.1f}",
                       f"{projected / rates[first]:.2f}")
     Console().print(table)
-    if len(sys.argv) > 1:
-        Path(sys.argv[1]).write_text(json.dumps(found, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -3,17 +3,14 @@ against the same cores in one process; the same scenes, in turn, round after rou
 
 from __future__ import annotations
 
-import json
-import sys
 import tempfile
 import time
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 from rich.console import Console
-from rich.table import Table
 
+from benchmarks.rounds import compared, in_turn
 from deploy.launch import PROCESSES, launch
 from deploy.registry import local_pairs
 from shared.config import Config
@@ -59,18 +56,9 @@ def on_bus(recorder: bool) -> float:
 
 
 def main() -> None:
-    found: dict[str, list[float]] = {"one process": [], "bus": [], "bus, recorded": []}
-    ways = [("one process", here), ("bus", partial(on_bus, False)), ("bus, recorded", partial(on_bus, True))]
-    for number in range(ROUNDS):
-        for name, measure in ways[number % len(ways):] + ways[:number % len(ways)]:  # none is always the first
-            found[name].append(measure())
-    medians = {name: float(np.median(values)) for name, values in found.items()}
-    table = Table("where", "steps per s", "of one process", "of the bus without recorder")
-    for name, value in medians.items():
-        table.add_row(name, f"{value:.2f}", f"{value / medians['one process']:.3f}", f"{value / medians['bus']:.3f}")
-    Console().print(table)
-    if len(sys.argv) > 1:
-        Path(sys.argv[1]).write_text(json.dumps(found, indent=1) + "\n")
+    """Prints a table; with a file's name, writes the numbers there."""
+    ways = {"one process": here, "bus": partial(on_bus, False), "bus, recorded": partial(on_bus, True)}
+    Console().print(compared(in_turn(ways, ROUNDS), "where", ("one process", "bus")))
 
 
 if __name__ == "__main__":

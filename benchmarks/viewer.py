@@ -4,27 +4,26 @@ round after round. The browser draws in software, on the same processors, with w
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import psutil
 from rich.console import Console
-from rich.table import Table
 
 from benchmarks.loop import CONFIG, Clock
+from benchmarks.rounds import compared, in_turn
 from deploy.launch import launch
 from deploy.registry import agent_processes
 from deploy.supervisor import VIEWER
+from services.viewer.priority import step_back
 from services.viewer.server import url_of, with_free_ports
 from shared.topics import STATUS, TRUTH
 
@@ -41,8 +40,9 @@ def browser(url: str) -> Iterator[int]:
     if program is None:
         sys.exit("saccade: no Chromium is installed: apt-get install chromium")
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
-        child = subprocess.Popen(["chrt", "--idle", "0", program, *FLAGS, f"--user-data-dir={profile}", url],
-                                 stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
+        child = subprocess.Popen([program, *FLAGS, f"--user-data-dir={profile}", url],
+                                 stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
+                                 preexec_fn=step_back)
         try:
             yield child.pid
         finally:
@@ -74,22 +74,11 @@ def viewer_of(folder: str) -> int:
 
 def main() -> None:
     """Prints a table; with a file's name, writes the numbers there."""
-    ways: list[tuple[str, Callable[[], float]]] = [
-        ("no viewer", partial(measure, False)), ("viewer", partial(measure, True)),
-        ("viewer and browser", partial(measure, True, look=True)),
-        ("browser suspended", partial(measure, True, look=True, suspend="browser")),
-        ("viewer suspended", partial(measure, True, suspend="viewer"))]
-    found: dict[str, list[float]] = {name: [] for name, _ in ways}
-    for number in range(ROUNDS):
-        for name, way in ways[number % len(ways):] + ways[:number % len(ways)]:  # none is always the first
-            found[name].append(way())
-    medians = {name: float(np.median(values)) for name, values in found.items()}
-    table = Table("who looks", "steps per s", "of no viewer")
-    for name, value in medians.items():
-        table.add_row(name, f"{value:.2f}", f"{value / medians['no viewer']:.3f}")
-    Console().print(table)
-    if len(sys.argv) > 1:
-        Path(sys.argv[1]).write_text(json.dumps(found, indent=1) + "\n")
+    ways = {"no viewer": partial(measure, False), "viewer": partial(measure, True),
+            "viewer and browser": partial(measure, True, look=True),
+            "browser suspended": partial(measure, True, look=True, suspend="browser"),
+            "viewer suspended": partial(measure, True, suspend="viewer")}
+    Console().print(compared(in_turn(ways, ROUNDS), "who looks", ("no viewer",)))
 
 
 if __name__ == "__main__":

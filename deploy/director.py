@@ -24,7 +24,7 @@ from typing import Any
 from rich.console import Console
 
 from deploy.container import LATEST, OVER, ROUTER_S, heartbeat_file, runs_folder
-from deploy.display import LINE_EVERY, Progress, line
+from deploy.display import LINE_EVERY, Progress, line, say
 from deploy.ending import ending
 from deploy.launch import LOG_NAME, Graph, follow, messages, resolve
 from deploy.options import configured, numbers, weights_folder
@@ -123,22 +123,22 @@ def _follow(folder: Path, processes: Sequence[Process], console: Console, worlds
     progress, arrived = Progress(judged=not config.bus.live), queue.SimpleQueue()
     view = FRAME if config.bus.live else TRUTH
 
-    def say(text: str) -> None:
-        console.print(prefix + text, markup=False, highlight=False, soft_wrap=True)
+    def tell(text: str) -> None:
+        say(console, prefix + text)
 
     def on_message(topic: Topic, part: str | None, message: Message) -> None:
         progress.take(topic, part, message)
         if topic == view and message.step % LINE_EVERY == 0:
-            say(line(progress))
+            tell(line(progress))
 
     with closing(ZenohBus(config.bus.endpoint, world=config.bus.world, timeout_s=ROUTER_S)) as bus:
         bus.subscribe((view, *SHOWN), lambda *item: arrived.put(item))
-        elsewhere = Elsewhere([process.name for process in processes[1:]], say)  # the router is the first world's
+        elsewhere = Elsewhere([process.name for process in processes[1:]], tell)  # the router is the first world's
         graph = Graph(bus, elsewhere, messages(arrived, bus, elsewhere, config.run))
         results = follow(graph, processes, on_message)
     for text in ending(config, results, progress):
-        say(text)
-    say(f"log: {Path(runs_folder().name) / folder.relative_to(runs_folder()) / LOG_NAME}")
+        tell(text)
+    tell(f"log: {Path(runs_folder().name) / folder.relative_to(runs_folder()) / LOG_NAME}")
     return results
 
 

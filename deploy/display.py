@@ -19,6 +19,11 @@ LINE_EVERY = 10  # steps, in plain mode
 PER_SECOND = 8
 
 
+def say(console: Console, text: str) -> None:
+    """A line as it is: neither wrapped nor coloured."""
+    console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
 class Progress:
     """What the messages of a run have told so far. `judged`: the truth knows the goal's view, so distances tell. `at`:
     episode and step of the newest view; `declared`: the plan by which the agent first said that it is there."""
@@ -169,7 +174,7 @@ class Display:
 
     def say(self, text: str) -> None:
         """A line that stays: what befell a service, what a camera assumes."""
-        self.console.print(text, markup=False, highlight=False, soft_wrap=True)
+        say(self.console, text)
 
     def take(self, topic: Topic, part: str | None, message: Message) -> None:
         """To be called with every message of these topics."""
@@ -177,7 +182,7 @@ class Display:
         if topic == STATUS and part == self._camera:
             self.note(message.note)
         if self.plain and topic == self._view and message.step % LINE_EVERY == 0:
-            self.console.print(line(self.progress), markup=False, highlight=False, soft_wrap=True)
+            say(self.console, line(self.progress))
 
     def note(self, text: str) -> None:
         """Says the lines of a camera's notes that are new."""

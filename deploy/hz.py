@@ -16,6 +16,7 @@ from rich.console import Console
 from rich.live import Live as Display
 from rich.table import Table
 
+from deploy.display import say
 from deploy.listen import TICK_S, Live, Logged, Wanted, live, until_interrupted
 from deploy.logs.source import log_of
 from shared.topics import Topic
@@ -86,9 +87,9 @@ def hz(key: str, *, log: Path | None, count: int | None, endpoint: str | None, r
         if rates.total == count:
             break
     for line in _lines(rates.rows(source.world)):
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
+        say(console, line)
     if source.reader.cut:
-        console.print(source.reader.cut, markup=False, highlight=False, soft_wrap=True)
+        say(console, source.reader.cut)
 
 
 def follow(source: Live, count: int | None, console: Console) -> Rates:
@@ -102,14 +103,14 @@ def follow(source: Live, count: int | None, console: Console) -> Rates:
                 display.update(_table(rates.rows(source.world, now_s)), refresh=True)
             elif now_s - told_s >= LINES_EVERY_S:
                 told_s = now_s
-                _say(console, rates, source.world, now_s)
-    _say(console, rates, source.world, time.monotonic())
+                _tell(console, rates, source.world, now_s)
+    _tell(console, rates, source.world, time.monotonic())
     return rates
 
 
-def _say(console: Console, rates: Rates, world: str, now_s: float) -> None:
+def _tell(console: Console, rates: Rates, world: str, now_s: float) -> None:
     for line in _lines(rates.rows(world, now_s)):
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
+        say(console, line)
 
 
 def _lines(rows: list[tuple[str, ...]]) -> Iterator[str]:

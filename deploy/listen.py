@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from deploy.supervisor import CONFIG_NAME
 from shared.bus import ZenohBus
-from shared.config import BusConfig, load
+from shared.config import BusConfig, Config, load
 from shared.errors import SaccadeError
 from shared.process import Inbox
 from shared.reading import RunReader
@@ -145,17 +145,21 @@ class Logged:
 
 
 def live(wanted: Wanted, *, endpoint: str | None, run: Path | None) -> Live:
-    """The bus at an endpoint, of a run's folder, or of the newest run whose bus answers. Raises SaccadeError where none
-    does."""
+    """The messages of a run that goes on, of `config_of`. Raises SaccadeError where none does."""
+    bus = config_of(endpoint=endpoint, run=run).bus
+    return Live(wanted, bus.endpoint, bus.world if wanted.world in (None, "*") else wanted.world)
+
+
+def config_of(*, endpoint: str | None, run: Path | None) -> Config:
+    """The configuration of the run in a folder, or of the newest whose bus answers; of one at an endpoint nothing else
+    is known. Raises SaccadeError where there is none."""
     if endpoint is not None and run is not None:
         raise SaccadeError("--endpoint and --run both name a bus: give one of them")
-    if endpoint is None:
-        bus = bus_of(run or newest_run())
-        endpoint = bus.endpoint
-    else:
-        bus = BusConfig()
-    world = bus.world if wanted.world in (None, "*") else wanted.world
-    return Live(wanted, endpoint, world)
+    if endpoint is not None:
+        return Config().with_values({"bus.endpoint": endpoint})
+    folder = run or newest_run()
+    bus_of(folder)
+    return load(folder / CONFIG_NAME).with_values({"run": folder.resolve().name})
 
 
 def bus_of(run: Path) -> BusConfig:

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 from rich.table import Table
 
+from deploy.display import say
 from deploy.logs.check import missing
 from deploy.moved import Moved
 from deploy.options import weights_folder
@@ -103,7 +105,7 @@ def _pass(replays: Sequence[Replay], bus: str, folder: Path, swapped: bool, cons
         take = moved.take if swapped else None
         with Keys(enabled=len(replays) == 1) as keys:
             run = replay_on_bus if bus == "zenoh" else replay_here
-            return run(replay, place, keys, _sayer(console), take), moved
+            return run(replay, place, keys, partial(say, console), take), moved
 
     if bus == "zenoh" and len(replays) > 1:
         with ThreadPoolExecutor(len(replays)) as pool:
@@ -114,27 +116,27 @@ def _pass(replays: Sequence[Replay], bus: str, folder: Path, swapped: bool, cons
         tell(replay, outcome, console)
         if swapped:
             _tell_moved(moved, place, console)
-        console.print(f"the replay's log is in {place}", markup=False, highlight=False, soft_wrap=True)
+        say(console, f"the replay's log is in {place}")
     return all(outcome.comparison.equal for outcome, _ in results)
 
 
 def tell(replay: Replay, outcome: Outcome, console: Console) -> None:
     """One replay in a few lines."""
-    comparison, say = outcome.comparison, _sayer(console)
+    comparison, note = outcome.comparison, partial(say, console)
     count = sum(outcome.played.values())
-    say(f"{replay.log}: {count} messages played into {', '.join(replay.into)}; {comparison.compared} answers compared, "
-        f"{comparison.unequal} differ in a byte, {comparison.beyond} beyond what is tolerated")
+    note(f"{replay.log}: {count} messages played into {', '.join(replay.into)}; {comparison.compared} answers "
+         f"compared, {comparison.unequal} differ in a byte, {comparison.beyond} beyond what is tolerated")
     for difference in [d for d in comparison.differences if not d.tolerated][:TOLD]:
-        say(f"  {difference}")
+        note(f"  {difference}")
     if comparison.beyond > TOLD:
-        say(f"  ... {comparison.beyond} messages in all")
+        note(f"  ... {comparison.beyond} messages in all")
     for what, only in (("only in the recording", comparison.only_recorded), ("only now", comparison.only_replayed)):
         for topic, part, episode, step in only[:TOLD]:
-            say(f"  {what}: {topic}{f'/{part}' if part else ''} of step {step} of episode {episode}")
+            note(f"  {what}: {topic}{f'/{part}' if part else ''} of step {step} of episode {episode}")
         if len(only) > TOLD:
-            say(f"  ... {len(only)} messages are {what}")
+            note(f"  ... {len(only)} messages are {what}")
     if replay.pace.rate is not None and outcome.late_s > 0.1:
-        say(f"  the services were too slow for {replay.pace.rate:g} x: up to {outcome.late_s:.1f} s behind")
+        note(f"  the services were too slow for {replay.pace.rate:g} x: up to {outcome.late_s:.1f} s behind")
     _tell_losses(outcome, console)
 
 
@@ -147,8 +149,8 @@ def _tell_losses(outcome: Outcome, console: Console) -> None:
                                                    status.gaps)))
         console.print(table)
     lost = sum(report.lost.values()) + len(report.absent)
-    _sayer(console)(f"loss: {lost} of {report.messages} messages of the replay's log"
-                    + (f"; {report.cut}" if report.cut else ""))
+    say(console, f"loss: {lost} of {report.messages} messages of the replay's log"
+        + (f"; {report.cut}" if report.cut else ""))
 
 
 def _tell_moved(moved: Moved, place: Path, console: Console) -> None:
@@ -157,8 +159,4 @@ def _tell_moved(moved: Moved, place: Path, console: Console) -> None:
     with (place / TABLE_NAME).open("w") as file:
         Console(file=file, width=110).print(table)
     moved.draw(place / PICTURE_NAME)
-    _sayer(console)(f"how far things moved: {place / TABLE_NAME}, {place / PICTURE_NAME}")
-
-
-def _sayer(console: Console) -> Callable[[str], None]:
-    return lambda text: console.print(text, markup=False, highlight=False, soft_wrap=True)
+    say(console, f"how far things moved: {place / TABLE_NAME}, {place / PICTURE_NAME}")

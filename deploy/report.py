@@ -14,6 +14,7 @@ from rich.console import Console
 
 from deploy import report_pictures as pictures
 from deploy.bench import SCENES_ENDING
+from deploy.display import say
 from deploy.failures import failed_scenes, section
 from deploy.rerun import Again, Results, prepare_again, read_results, replay, same_as, told_otherwise
 from deploy.table import MEASURES, PAPER, PAPER_AGENTS, PAPER_ROOM, Estimate, Figures, Row, milliseconds, rows
@@ -218,7 +219,7 @@ def _episodes(files: Sequence[Results], again: dict[Path, Any], out: Path, conso
     for file in files:
         ready = again[file.path]
         if isinstance(ready, SaccadeError):
-            console.print(f"saccade: no episodes of {file.label}: {ready}", markup=False, soft_wrap=True)
+            say(console, f"saccade: no episodes of {file.label}: {ready}")
             lines += [f"{file.label}: not run again, since its scenes or weights are not at hand.", ""]
             continue
         console.print(f"running scenes of {file.label} again", markup=False)
@@ -260,4 +261,4 @@ def _failed(file: Results, ready: Again | SaccadeError, out: Path, jobs: int, co
 
 def _write(path: Path, lines: Sequence[str], console: Console) -> None:
     path.write_text("\n".join(lines).rstrip("\n") + "\n")
-    console.print(f"written to {path}", markup=False, soft_wrap=True)
+    say(console, f"written to {path}")

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from deploy.display import Display
+from deploy.display import Display, say
 from deploy.ending import ending
 from deploy.launch import launched
 from deploy.registry import DEFAULT_WORLD, agent_of, agent_processes, local_pairs, world_of
@@ -168,9 +168,9 @@ def _interrupted_between_messages() -> Iterator[Callable[[], None]]:
 
 def _tell(config: Config, results: list[Result], display: Display, folder: Path, console: Console) -> None:
     for text in ending(config, results, display.progress):
-        console.print(text, markup=False, highlight=False, soft_wrap=True)
+        say(console, text)
     _draw(folder)
-    console.print(f"log, configuration and picture are in {folder}", markup=False, highlight=False, soft_wrap=True)
+    say(console, f"log, configuration and picture are in {folder}")
 
 
 def _new_folder(folder: Path) -> Path:

@@ -12,15 +12,15 @@ from pathlib import Path
 import rerun as rr
 from rich.console import Console
 
-from deploy.listen import bus_of, newest_run, until_interrupted
+from deploy.display import say
+from deploy.listen import config_of, until_interrupted
 from deploy.logs.source import LOG_NAME, Log, log_of, whole
-from deploy.supervisor import CONFIG_NAME
 from services.viewer.core import Viewer
-from services.viewer.live import QUEUE_BYTES, connected, step_back, watch
+from services.viewer.live import QUEUE_BYTES, connected, watch
+from services.viewer.priority import step_back
 from services.viewer.server import Server, with_free_ports
 from shared.bus import ZenohBus
-from shared.config import Config, ViewerConfig, load, validate
-from shared.errors import SaccadeError
+from shared.config import Config, ViewerConfig, validate
 from shared.process import Health, Inbox
 from shared.topics import GOAL_PERCEPT
 
@@ -39,10 +39,10 @@ def view_log(path: Path, *, save: Path | None, truth: bool, port: int | None, op
             recording.save(partial)
             _show(log, recording, truth, weights)
             recording.disconnect()
-        _say(console, f"written to {save}: `rerun {save}` shows it")
+        say(console, f"written to {save}: `rerun {save}` shows it")
         return
     with Server(_ports(Config(), port).viewer) as server, connected(recording, server):
-        _say(console, f"{path} at {server.url} until Ctrl-C")
+        say(console, f"{path} at {server.url} until Ctrl-C")
         if open_page:
             webbrowser.open(server.url)
         _show(log, recording, truth, weights)
@@ -52,15 +52,16 @@ def view_log(path: Path, *, save: Path | None, truth: bool, port: int | None, op
 def view_live(*, endpoint: str | None, run: Path | None, truth: bool, port: int | None, open_page: bool,
               weights: Path | None, console: Console) -> None:
     """Shows a run that goes on, from its start, until Ctrl-C. Raises SaccadeError where there is none."""
+    config = _with_weights(config_of(endpoint=endpoint, run=run), weights)
+    config = _ports(config, port).with_values({"viewer.truth": truth})
     step_back()
-    config = _ports(_with_weights(_of_run(endpoint, run), weights), port).with_values({"viewer.truth": truth})
     inbox = Inbox(QUEUE_BYTES)
     with (closing(ZenohBus(config.bus.endpoint, world=config.bus.world, onlooker=True)) as bus,
           Server(config.viewer) as server):
         if not config.scene.names:
             names = sorted({kept.part for kept in bus.recall((GOAL_PERCEPT,)) if kept.part})
             config = config.with_values({"scene.names": names})
-        _say(console, f"{config.run or config.bus.endpoint} at {server.url} until Ctrl-C")
+        say(console, f"{config.run or config.bus.endpoint} at {server.url} until Ctrl-C")
         if open_page:
             webbrowser.open(server.url)
         with until_interrupted(inbox.stop):
@@ -89,16 +90,6 @@ def _with_weights(config: Config, weights: Path | None) -> Config:
     return config if weights is None else config.with_values({"perception.weights": weights.resolve()})
 
 
-def _of_run(endpoint: str | None, run: Path | None) -> Config:
-    if endpoint is not None and run is not None:
-        raise SaccadeError("--endpoint and --run both name a bus: give one of them")
-    if endpoint is not None:
-        return Config().with_values({"bus.endpoint": endpoint})
-    folder = run or newest_run()
-    bus_of(folder)
-    return load(folder / CONFIG_NAME).with_values({"run": folder.resolve().name})
-
-
 def _show(log: Log, recording: rr.RecordingStream, truth: bool, weights: Path | None) -> None:
     """Every message of a log; says what could not be shown."""
     viewer = None
@@ -112,8 +103,4 @@ def _show(log: Log, recording: rr.RecordingStream, truth: bool, weights: Path | 
 
 def _tell(lacks: list[str], console: Console) -> None:
     for text in lacks:
-        _say(console, text)
-
-
-def _say(console: Console, text: str) -> None:
-    console.print(text, markup=False, highlight=False, soft_wrap=True)
+        say(console, text)

@@ -11,11 +11,12 @@ from shared.errors import SaccadeError
 
 app = typer.Typer()
 
-Log = Annotated[Path, typer.Argument(metavar="RUN", help="folder of a run, or its log")]
+RUN = typer.Argument(metavar="RUN", help="folder of a run, or its log")
+Log = Annotated[Path, RUN]
 
 
 @app.command()
-def view(*, log: Annotated[Path | None, typer.Argument(metavar="RUN", help="folder of a run, or its log")] = None,
+def view(*, log: Annotated[Path | None, RUN] = None,
          live: Annotated[bool, typer.Option("--live", help="a run that goes on, instead of a log")] = False,
          save: Annotated[Path | None, typer.Option(
              help="write a recording for Rerun's own viewer instead", metavar="RUN.rrd")] = None,
@@ -52,12 +53,12 @@ def picture(log: Log,
             out: Annotated[Path | None, typer.Option(help="file [default: picture.png beside the log]")] = None,
             episode: Annotated[int | None, typer.Option(min=0, help="which one [default: the last]")] = None) -> None:
     """Draw the picture of a run from its log once more."""
+    from deploy.logs.source import log_of
     from deploy.picture import draw
-    from deploy.run import LOG_NAME, PICTURE_NAME
+    from deploy.run import PICTURE_NAME
 
-    file = log / LOG_NAME if log.is_dir() else log
-    target = out or file.with_name(PICTURE_NAME)
-    draw(file, target, episode)
+    target = out or log_of(log).with_name(PICTURE_NAME)
+    draw(log_of(log), target, episode)
     print(f"written to {target}")
 
 

@@ -21,7 +21,6 @@ from shared.weights import Architecture
 LATENT = 8
 
 
-
 def conv_stack(channels_in: int, width: int) -> nn.Sequential:
     """Four 4x4 convolutions of stride 2 (tables 5 and 4): [B, C, 64, 64] -> [B, 256 width]."""
     layers: list[nn.Module] = []

@@ -23,7 +23,6 @@ MEET_S = 0.1  # after so long one that has joined knows who else is there
 JOIN_S = 0.5  # one that has joined lets the others finish what they have begun
 
 
-
 def shares(parts: Iterable[str], members: Iterable[str]) -> dict[str, str]:
     """For each part the member that answers for it: the one that scores highest for it, of those that have room. Shares
     differ by one at most."""

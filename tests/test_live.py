@@ -268,5 +268,3 @@ def test_killed_while_nobody_waits_a_service_goes_on_with_the_newest(tmp_path, n
     assert steps["plan", None][-1] == frames - 1
     for key in (("percept", "mug"), ("belief", "can"), ("plan", None)):
         assert len(set(steps[key])) == len(steps[key]) > 5
-
-

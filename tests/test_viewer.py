@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections import defaultdict
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -147,6 +148,21 @@ def test_a_log_that_lacks_topics_shows_what_it_has_and_says_what_it_lacks(monkey
     assert any("no plan" in text for text in seen.words())
     assert seen.of("/world/objects/mug/particles", "Points3D:positions")
     assert seen.of("/world/camera/image", "EncodedImage:blob")
+
+
+def test_live_crops_are_drawn_now_and_then_only(monkeypatch, tmp_path):
+    """A browser is sent something twice a second: ten steps a second need not all be drawn."""
+    recording, now_s = rr.RecordingStream("saccade"), 0.0
+    recording.save(tmp_path / "run.rrd")
+    monkeypatch.setattr("services.viewer.core.time", SimpleNamespace(monotonic=lambda: now_s))
+    viewer = Viewer(recording, Config(scene={"names": NAMES}), truth=False, live=True)
+    frame = sample(FRAME.type, run="r", episode=0)
+    for step in range(12):
+        viewer.take(FRAME, None, replace(frame, step=step, seq=step))
+        now_s += 0.125
+    viewer.close()
+    recording.disconnect()
+    assert list(Seen(tmp_path / "run.rrd").of("/crops/image", "EncodedImage:blob")) == [0, 4, 8]
 
 
 def test_what_is_kept_of_a_step_does_not_grow_with_the_run(tmp_path):

@@ -11,6 +11,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.markup import escape
 
+from deploy.display import say
 from services.recorder.core import LOG_NAME
 from shared.errors import SaccadeError
 from shared.messages import Message
@@ -49,7 +50,7 @@ class Log:
         if not self.read:
             raise SaccadeError(f"log {self.reader.path} holds no messages of Saccade: give the run.mcap of a run")
         for line in self.lacks.values():
-            self.console.print(line, markup=False, highlight=False, soft_wrap=True)
+            say(self.console, line)
 
     @property
     def lacks(self) -> dict[str, str]:

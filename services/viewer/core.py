@@ -5,6 +5,8 @@ Live and from a log it is the same code. The steps of several episodes follow on
 
 from __future__ import annotations
 
+import math
+import time
 from dataclasses import dataclass, field
 
 import rerun as rr
@@ -22,6 +24,7 @@ from shared.stepper import settle
 from shared.topics import BELIEF, FRAME, GOAL, PERCEPT, PLAN, RESULT, STATUS, TRUTH, Topic
 from shared.weights import Weights
 
+LIVE_PAUSE_S = 0.5  # between drawings of crops while a run goes on: browsers are sent no more than that either
 WITHOUT = {  # what is not there to be seen without a topic
     FRAME: "the camera and what it sees", GOAL: "the goal", PERCEPT: "boxes, masks and crops",
     BELIEF: "particles, beliefs, entropy and F", PLAN: "candidates, viewpoints, G and decisions",
@@ -57,6 +60,7 @@ class Viewer:
         self._step, self._believed = Step(), {}
         self._said = ""
         self._came: set[str] = set()
+        self._pause_s, self._drawn_s = LIVE_PAUSE_S if live else 0.0, -math.inf
 
     def take(self, topic: Topic, part: str | None, message: Message) -> None:
         """Any message, in the order of arrival; what is not shown is passed over."""
@@ -115,7 +119,8 @@ class Viewer:
             self._to.set_time(STEP, sequence=self._first + self._newest)
         if step.beliefs:
             self._curves.beliefs(step.beliefs)
-        if step.frame is not None:
+        if step.frame is not None and time.monotonic() - self._drawn_s >= self._pause_s:
+            self._drawn_s = time.monotonic()
             self._images.step(step.frame, step.percepts)
 
     def _frame(self, frame: Frame) -> None:
@@ -133,7 +138,7 @@ class Viewer:
         self._world.belief(belief)
 
     def _plan(self, plan: Plan) -> None:
-        self._world.plan(plan, self._images.planned_px)
+        self._world.plan(plan)
         self._images.plan(plan, self._believed)
         self._curves.plan(plan)
         self._say(decision(plan, self._believed.values()))

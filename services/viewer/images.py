@@ -9,7 +9,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from services.viewer.imagination import Imagination
-from services.viewer.layout import CELL_PX, ROW_PX, VIEW_PX, Colour
+from services.viewer.layout import CELL_PX, ROW_PX, Colour
 from services.viewer.words import SEEN, plain
 from services.viewer.world import CAMERA, VIEWPOINT
 from shared.messages import Belief, Frame, Goal, Percept, Plan
@@ -90,11 +90,6 @@ class Images:
         self._viewpoint = plan.viewpoint
         known = [belief for belief in beliefs.values() if belief.presence >= SEEN]
         self._image(IMAGINED, self._imagination.planned_view(plan.viewpoint, known, self._seen))
-
-    @property
-    def planned_px(self) -> int:
-        """Side of the view that is imagined."""
-        return VIEW_PX
 
     def _image(self, path: str, rgb: NDArray[np.uint8]) -> None:
         self._to.log(path, rr.Image(rgb).compress(jpeg_quality=JPEG_QUALITY))

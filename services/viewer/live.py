@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from datetime import timedelta
@@ -12,6 +11,7 @@ import rerun as rr
 
 from services.viewer import SHOWN
 from services.viewer.core import Viewer
+from services.viewer.priority import step_back
 from services.viewer.server import Server
 from shared.bus import Bus, ZenohBus
 from shared.config import Config
@@ -41,14 +41,6 @@ def _work(config: Config, folder: Path, inbox: Inbox) -> None:
           closing(ZenohBus(config.bus.endpoint, world=config.bus.world, onlooker=True)) as bus,
           Heartbeat(bus, health, inbox.stop)):
         watch(bus, server, config, inbox, health)
-
-
-def step_back() -> None:
-    """This process, and what it starts, has what the agent leaves of the processors."""
-    try:
-        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
-    except (AttributeError, OSError):  # not Linux, or not allowed
-        os.nice(19)
 
 
 def watch(bus: Bus, server: Server, config: Config, inbox: Inbox, health: Health) -> list[str]:

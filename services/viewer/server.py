@@ -20,6 +20,7 @@ from pathlib import Path
 from types import TracebackType
 
 from services.viewer.door import open_door
+from services.viewer.priority import step_back_session
 from shared.config import Config, ViewerConfig
 from shared.errors import SaccadeError
 
@@ -75,7 +76,7 @@ class Server:
             command += ["--cors-allow-origin", f"http://*:{config.port}"]
         with log.open("wb") as out:
             child = subprocess.Popen(command, env=self._environment(), stdin=subprocess.DEVNULL, stdout=out,
-                                     stderr=subprocess.STDOUT, start_new_session=True, preexec_fn=_end_with_parent())
+                                     stderr=subprocess.STDOUT, start_new_session=True, preexec_fn=_as_child())
         end_s = time.monotonic() + START_S
         while not (listens(self.address, self.data_port) and listens(self.address, pages)):
             if child.poll() is not None or time.monotonic() > end_s:
@@ -144,9 +145,10 @@ def listens(address: str, port: int) -> bool:
         return False
 
 
-def _end_with_parent() -> Callable[[], None] | None:
-    """On Linux: a parent that is killed takes the server with it, and its ports are free again."""
+def _as_child() -> Callable[[], None] | None:
+    """On Linux: a parent that is killed takes the server with it, and its ports are free again; the server's session
+    comes last."""
     if sys.platform != "linux":
         return None
     prctl = ctypes.CDLL(None).prctl
-    return lambda: prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    return lambda: (prctl(PR_SET_PDEATHSIG, signal.SIGKILL), step_back_session())

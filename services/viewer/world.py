@@ -9,7 +9,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import ArrayLike, NDArray
 
-from services.viewer.layout import PATH, PLANNED, TABLE, TRUE, Colour, between
+from services.viewer.layout import PATH, PLANNED, TABLE, TRUE, VIEW_PX, Colour, between
 from services.viewer.words import SEEN, plain
 from shared.geometry import IMAGE_SIZE_PX, INTRINSICS_PX
 from shared.messages import Belief, Frame, Plan, Truth
@@ -74,11 +74,10 @@ class World:
             centers=[belief.mean_m], half_sizes=[CHI_95 * np.sqrt(np.maximum(values, 1e-8))],
             quaternions=[rr.Quaternion(xyzw=quaternion(vectors))], **look))
 
-    def plan(self, plan: Plan, size_px: int) -> None:
-        """The best candidates, the best one green, and the chosen viewpoint. `size_px`: side of the image that is
-        imagined there."""
-        scale = size_px / IMAGE_SIZE_PX
-        self._camera(VIEWPOINT, plan.viewpoint, np.array(INTRINSICS_PX) * scale, (size_px, size_px), PLANNED_M, PLANNED)
+    def plan(self, plan: Plan) -> None:
+        """The best candidates, the best one green, and the chosen viewpoint, with the image that is imagined there."""
+        imagined_px = np.array(INTRINSICS_PX) * (VIEW_PX / IMAGE_SIZE_PX)
+        self._camera(VIEWPOINT, plan.viewpoint, imagined_px, (VIEW_PX,) * 2, PLANNED_M, PLANNED)
         if plan.best_eyes_m is not None:
             above = plan.best_g - plan.best_g.min()
             shares = above / max(float(above.max()), 1e-6)

@@ -1,0 +1,42 @@
+"""Ways of doing the same, measured in turn, round after round: what else a machine does changes by the minute."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from rich.table import Table
+
+Found = dict[str, list[float]]
+
+
+def in_turn(ways: Mapping[str, Callable[[], float]], rounds: int) -> Found:
+    """What each way measured, by rounds; none is always the first. The numbers so far go to the file, if any, that the
+    command line names."""
+    names = list(ways)
+    found: Found = {name: [] for name in names}
+    for number in range(rounds):
+        first = number % len(names)
+        for name in names[first:] + names[:first]:
+            found[name].append(ways[name]())
+        if len(sys.argv) > 1:
+            Path(sys.argv[1]).write_text(json.dumps(found, indent=1) + "\n")
+    return found
+
+
+def ratio(values: Sequence[float], to: Sequence[float]) -> str:
+    """Mean of the rounds' ratios, with its 95 % interval."""
+    ratios = np.divide(values, to)
+    return f"{ratios.mean():.3f} ± {1.96 * ratios.std(ddof=1) / np.sqrt(len(ratios)):.3f}"
+
+
+def compared(found: Found, what: str, against: Sequence[str]) -> Table:
+    """Medians of steps per second, and ratios to some of the ways."""
+    table = Table(what, "steps per s", *(f"of {name}" for name in against))
+    for name, values in found.items():
+        table.add_row(name, f"{np.median(values):.2f}",
+                      *("1" if name == other else ratio(values, found[other]) for other in against))
+    return table
