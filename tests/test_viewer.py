@@ -150,15 +150,42 @@ def test_a_log_that_lacks_topics_shows_what_it_has_and_says_what_it_lacks(monkey
     assert seen.of("/world/camera/image", "EncodedImage:blob")
 
 
+def unseen(step):
+    return sample(PERCEPT.type, run="r", episode=0, step=step, object=NAMES[0], presence=0.0)
+
+
+def test_what_is_seen_stands_on_the_image_it_was_seen_in(monkeypatch, tmp_path):
+    """A camera does not wait: perception leaves images out, and is behind it, as beliefs are behind perception."""
+    recording, drawn = rr.RecordingStream("saccade"), []
+    recording.save(tmp_path / "run.rrd")
+    viewer = Viewer(recording, Config(scene={"names": NAMES[:1]}), truth=False, live=False)
+    monkeypatch.setattr("services.viewer.core.Images.step", lambda self, frame, percepts: drawn.append(
+        (frame.step, {percept.step for percept in percepts.values()})))
+    told = [("frame", 0), ("frame", 1), ("percept", 0), ("frame", 2), ("frame", 3), ("belief", 0), ("percept", 2),
+            ("percept", 4), ("frame", 4), ("belief", 2), ("frame", 5), ("frame", 6), ("percept", 6)]
+    messages = {"frame": lambda step: (FRAME, None, sample(FRAME.type, run="r", episode=0, step=step)),
+                "percept": lambda step: (PERCEPT, NAMES[0], unseen(step)),
+                "belief": lambda step: (BELIEF, NAMES[0], sample(BELIEF.type, run="r", episode=0, step=step,
+                                                                 object=NAMES[0], presence=step / 10))}
+    for topic, step in told:
+        viewer.take(*messages[topic](step))
+    viewer.close()
+    recording.disconnect()
+    seen = Seen(tmp_path / "run.rrd")
+    assert list(seen.of("/world/camera/image", "EncodedImage:blob")) == [0, 2, 4, 6]
+    assert drawn == [(0, {0}), (2, {2}), (6, {6})]
+    assert {step: values[0] for step, values in seen.numbers("/presence").items()} == {0: 0.0, 2: 0.2}
+
+
 def test_live_crops_are_drawn_now_and_then_only(monkeypatch, tmp_path):
     """A browser is sent something twice a second: ten steps a second need not all be drawn."""
     recording, now_s = rr.RecordingStream("saccade"), 0.0
     recording.save(tmp_path / "run.rrd")
     monkeypatch.setattr("services.viewer.core.time", SimpleNamespace(monotonic=lambda: now_s))
     viewer = Viewer(recording, Config(scene={"names": NAMES}), truth=False, live=True)
-    frame = sample(FRAME.type, run="r", episode=0)
     for step in range(12):
-        viewer.take(FRAME, None, replace(frame, step=step, seq=step))
+        viewer.take(FRAME, None, sample(FRAME.type, run="r", episode=0, step=step))
+        viewer.take(PERCEPT, NAMES[0], unseen(step))
         now_s += 0.125
     viewer.close()
     recording.disconnect()

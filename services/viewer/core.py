@@ -19,12 +19,14 @@ from services.viewer.words import decision, ending
 from services.viewer.world import World
 from shared.config import Config
 from shared.errors import SaccadeError
+from shared.geometry import IMAGE_SIZE_PX
 from shared.messages import Belief, Frame, Message, Percept, Plan, Result, Status, Truth
 from shared.stepper import settle
 from shared.topics import BELIEF, FRAME, GOAL, PERCEPT, PLAN, RESULT, STATUS, TRUTH, Topic
 from shared.weights import Weights
 
 LIVE_PAUSE_S = 0.5  # between drawings of crops while a run goes on: browsers are sent no more than that either
+WAITING = 64  # images that wait for what is perceived in them
 WITHOUT = {  # what is not there to be seen without a topic
     FRAME: "the camera and what it sees", GOAL: "the goal", PERCEPT: "boxes, masks and crops",
     BELIEF: "particles, beliefs, entropy and F", PLAN: "candidates, viewpoints, G and decisions",
@@ -32,9 +34,11 @@ WITHOUT = {  # what is not there to be seen without a topic
 
 
 @dataclass
-class Step:
-    """What has come of one step."""
+class Gathered:
+    """What has come of one step, by object. In lockstep steps follow one another; where a camera does not wait,
+    perception may be some steps behind it, beliefs behind perception."""
 
+    step: int = -1
     frame: Frame | None = None
     percepts: dict[str, Percept] = field(default_factory=dict)
     beliefs: dict[str, Belief] = field(default_factory=dict)
@@ -57,7 +61,9 @@ class Viewer:
         self._show = {FRAME: self._frame, GOAL: self._images.goal, PERCEPT: self._percept, BELIEF: self._belief,
                       PLAN: self._plan, TRUTH: self._true, RESULT: self._result, STATUS: self._status}
         self._episode, self._first, self._newest = -1, 0, 0  # which one, where it begins on the timeline, its last step
-        self._step, self._believed = Step(), {}
+        self._frames: dict[int, Frame] = {}  # by step: in which nothing was perceived yet
+        self._seen, self._held = Gathered(), Gathered()  # percepts, beliefs of the newest step that has any
+        self._believed: dict[str, Belief] = {}
         self._said = ""
         self._came: set[str] = set()
         self._pause_s, self._drawn_s = LIVE_PAUSE_S if live else 0.0, -math.inf
@@ -68,6 +74,8 @@ class Viewer:
             return
         self._came.add(topic.name)
         if topic.in_step:
+            if message.episode < self._episode and topic != RESULT:
+                return
             self._move_to(message.episode, message.step)
         self._show[topic](settle(message))
 
@@ -103,39 +111,75 @@ class Viewer:
             self._finish()
             self._first += self._newest + 1 if self._episode >= 0 else 0
             self._episode, self._newest, self._believed, self._said = episode, 0, {}, ""
+            self._seen, self._held = Gathered(), Gathered()
             self._to.set_time(STEP, sequence=self._first)
             self._world.begin()
             self._images.begin()
         if episode == self._episode:
-            if step > self._newest:
-                self._finish()
-                self._newest = step
-            self._to.set_time(STEP, sequence=self._first + step)
+            self._newest = max(self._newest, step)
+            self._at(step)
+
+    def _at(self, step: int) -> None:
+        self._to.set_time(STEP, sequence=self._first + step)
 
     def _finish(self) -> None:
-        """What needs a step whole."""
-        step, self._step = self._step, Step()
-        if step.beliefs or step.percepts:
-            self._to.set_time(STEP, sequence=self._first + self._newest)
-        if step.beliefs:
-            self._curves.beliefs(step.beliefs)
-        if step.frame is not None and time.monotonic() - self._drawn_s >= self._pause_s:
-            self._drawn_s = time.monotonic()
-            self._images.step(step.frame, step.percepts)
+        """What waits for more of its step."""
+        for frame in self._frames.values():
+            self._at(frame.step)
+            self._images.frame(frame)
+        self._frames.clear()
+        self._draw_crops()
+        self._draw_beliefs()
+        self._at(self._newest)
 
     def _frame(self, frame: Frame) -> None:
-        self._step.frame = frame
         self._world.frame(frame)
-        self._images.frame(frame)
+        if frame.step <= self._seen.step:  # messages of the past come service by service
+            self._images.frame(frame)
+            return
+        self._frames[frame.step] = frame
+        if len(self._frames) > WAITING:
+            oldest = self._frames.pop(min(self._frames))
+            self._at(oldest.step)
+            self._images.frame(oldest)
 
     def _percept(self, percept: Percept) -> None:
-        self._step.percepts[percept.object] = percept
-        width = self._step.frame.rgb.shape[1] if self._step.frame else 480
+        """The images that perception left out are not shown: what was seen stands on the image it was seen in."""
+        if percept.step > self._seen.step:
+            self._draw_crops()
+            self._seen = Gathered(percept.step, self._frames.pop(percept.step, None))
+            self._frames = {step: frame for step, frame in self._frames.items() if step > percept.step}
+            self._at(percept.step)
+            if self._seen.frame is not None:
+                self._images.frame(self._seen.frame)
+        if percept.step == self._seen.step:
+            self._seen.percepts[percept.object] = percept
+        width = self._seen.frame.rgb.shape[1] if self._seen.frame else IMAGE_SIZE_PX
         self._images.percept(percept, width)
 
     def _belief(self, belief: Belief) -> None:
-        self._step.beliefs[belief.object] = self._believed[belief.object] = belief
+        if belief.step > self._held.step:
+            self._draw_beliefs()
+            self._held = Gathered(belief.step)
+            self._at(belief.step)
+        if belief.step == self._held.step:
+            self._held.beliefs[belief.object] = belief
+        self._believed[belief.object] = belief
         self._world.belief(belief)
+
+    def _draw_crops(self) -> None:
+        """Of the last step in which something was perceived."""
+        seen, self._seen = self._seen, Gathered(self._seen.step)
+        if seen.frame is not None and time.monotonic() - self._drawn_s >= self._pause_s:
+            self._drawn_s = time.monotonic()
+            self._at(seen.step)
+            self._images.step(seen.frame, seen.percepts)
+
+    def _draw_beliefs(self) -> None:
+        held, self._held = self._held, Gathered(self._held.step)
+        if held.beliefs:
+            self._at(held.step)
+            self._curves.beliefs(held.beliefs)
 
     def _plan(self, plan: Plan) -> None:
         self._world.plan(plan)
