@@ -45,6 +45,7 @@ def run(config: Config, *, agent: str, out: Path | None, plain: bool, console: C
     processes = agent_processes(agent, world, view=view) if config.bus.kind == "zenoh" else ()
     folder = _new_folder(out or Path("runs") / f"{time.strftime('%Y%m%d-%H%M%S')}-{config.seed}")
     judged = not config.scene.explore and config.scene.goal_image is None
+    ended = None  # of a run that was interrupted nothing stays to be looked at
     with ExitStack() as stack:
         with Display(console, plain=plain, judged=judged, camera=place.source if place.live else None) as display:
             if view:
@@ -61,7 +62,7 @@ def run(config: Config, *, agent: str, out: Path | None, plain: bool, console: C
                     raise
                 results = []
         _tell(config, results, display, folder, console)
-        if view and console.is_terminal:
+        if ended and console.is_terminal and ended.runs(VIEWER.name):
             from deploy.view import stay  # Rerun is loaded where it is wanted
 
             console.print(f"to be seen at {url_of(config.viewer)} until Ctrl-C", highlight=False)

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections import defaultdict
+from contextlib import contextmanager, suppress
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from deploy.picture import read_story
 from deploy.replay import prepare, replay_here, replay_on_bus
 from deploy.run import in_world, run
 from services.replayer.core import Keys, Pace
+from services.viewer.server import free_port
 from shared.config import REPOSITORY, Config, load
 from shared.errors import SaccadeError
 from shared.messages import Belief, Frame, Plan, Status
@@ -118,29 +120,51 @@ def test_live_processes_find_the_same_whatever_they_skip(filmed, tmp_path):
         replay_on_bus(replay, tmp_path / "bus", Keys(enabled=False), print)
 
 
-def test_ctrl_c_ends_a_run_with_its_log_and_its_picture(filmed, tmp_path):
-    """As it must end that of a webcam."""
+@contextmanager
+def interrupted(filmed, out, *options, **streams):
+    """The command on a film without end; Ctrl-C once it has been round."""
     video, poses, _ = filmed
-    out = tmp_path / "r"
     process = subprocess.Popen(
         [sys.executable, "-m", "deploy.cli", "run", "--world", "camera", "--source", video, "--poses", poses,
-         "--intrinsics", ",".join(map(str, LENS_PX)), "--loop", "--plain", "--out", out],
-        env={**os.environ, "PYTHONPATH": str(REPOSITORY)}, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+         "--intrinsics", ",".join(map(str, LENS_PX)), "--loop", "--plain", "--out", out, *options],
+        env={**os.environ, "PYTHONPATH": str(REPOSITORY)}, text=True, **streams)
     try:
         end = time.monotonic() + WAIT_S
         while time.monotonic() < end and not any(
                 topic == FRAME and message.step > VIEWS for topic, _, message in so_far(out / "run.mcap")):
             time.sleep(0.2)
         process.send_signal(signal.SIGINT)
-        text, errors = process.communicate(timeout=WAIT_S)
+        yield process
     finally:
         process.kill()
+
+
+def test_ctrl_c_ends_a_run_with_its_log_and_its_picture(filmed, tmp_path):
+    """As it must end that of a webcam."""
+    out = tmp_path / "r"
+    with interrupted(filmed, out, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        text, errors = process.communicate(timeout=WAIT_S)
     assert (process.returncode, errors) == (0, "")
     assert "found coffee_can" in text
     assert (out / "picture.png").is_file()
     report = missing(out / "run.mcap")
     assert report.cut is None
     assert report.lost == {}
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="a terminal of its own is POSIX's")
+def test_ctrl_c_on_a_terminal_ends_a_run_that_is_looked_at_too(filmed, tmp_path):
+    ours, theirs = os.openpty()
+    options = ("--view", "--set", f"viewer.port={free_port('127.0.0.1')}")
+    with interrupted(filmed, tmp_path / "r", *options, stdout=theirs, stderr=theirs) as process:
+        os.close(theirs)
+        code = process.wait(WAIT_S)
+    text = ""
+    with open(ours, errors="replace") as terminal, suppress(OSError):  # so Linux ends a terminal
+        for said in terminal:
+            text += said
+    assert code == 0, text
+    assert "found coffee_can" in text
 
 
 def test_with_a_goal_image_the_agent_says_where_it_is(filmed, tmp_path):
