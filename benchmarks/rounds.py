@@ -14,13 +14,14 @@ Found = dict[str, list[float]]
 
 
 def in_turn(ways: Mapping[str, Callable[[], float]], rounds: int) -> Found:
-    """What each way measured, by rounds; none is always the first. The numbers so far go to the file, if any, that the
-    command line names."""
+    """What each way measured, by rounds; none is always the first, or after the same other. The numbers so far go to
+    the file, if any, that the command line names."""
     names = list(ways)
     found: Found = {name: [] for name in names}
     for number in range(rounds):
-        first = number % len(names)
-        for name in names[first:] + names[:first]:
+        first = number // 2 % len(names)
+        order = names[first:] + names[:first]
+        for name in order[::-1] if number % 2 else order:
             found[name].append(ways[name]())
         if len(sys.argv) > 1:
             Path(sys.argv[1]).write_text(json.dumps(found, indent=1) + "\n")

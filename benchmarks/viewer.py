@@ -23,7 +23,7 @@ from benchmarks.rounds import compared, in_turn
 from deploy.launch import launch
 from deploy.registry import agent_processes
 from deploy.supervisor import VIEWER
-from services.viewer.priority import step_back
+from services.viewer.priority import come_last
 from services.viewer.server import url_of, with_free_ports
 from shared.topics import STATUS, TRUTH
 
@@ -42,7 +42,7 @@ def browser(url: str) -> Iterator[int]:
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         child = subprocess.Popen([program, *FLAGS, f"--user-data-dir={profile}", url],
                                  stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
-                                 preexec_fn=step_back)
+                                 preexec_fn=come_last)
         try:
             yield child.pid
         finally:

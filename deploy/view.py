@@ -17,7 +17,7 @@ from deploy.listen import config_of, until_interrupted
 from deploy.logs.source import LOG_NAME, Log, log_of, whole
 from services.viewer.core import Viewer
 from services.viewer.live import QUEUE_BYTES, connected, watch
-from services.viewer.priority import step_back
+from services.viewer.priority import come_last
 from services.viewer.server import Server, with_free_ports
 from shared.bus import ZenohBus
 from shared.config import Config, ViewerConfig, validate
@@ -54,7 +54,7 @@ def view_live(*, endpoint: str | None, run: Path | None, truth: bool, port: int 
     """Shows a run that goes on, from its start, until Ctrl-C. Raises SaccadeError where there is none."""
     config = _with_weights(config_of(endpoint=endpoint, run=run), weights)
     config = _ports(config, port).with_values({"viewer.truth": truth})
-    step_back()
+    come_last()
     inbox = Inbox(QUEUE_BYTES)
     with (closing(ZenohBus(config.bus.endpoint, world=config.bus.world, onlooker=True)) as bus,
           Server(config.viewer) as server):

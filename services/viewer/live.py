@@ -11,7 +11,7 @@ import rerun as rr
 
 from services.viewer import SHOWN
 from services.viewer.core import Viewer
-from services.viewer.priority import step_back
+from services.viewer.priority import come_last
 from services.viewer.server import Server
 from shared.bus import Bus, ZenohBus
 from shared.config import Config
@@ -35,7 +35,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def _work(config: Config, folder: Path, inbox: Inbox) -> None:
-    step_back()
+    come_last()
     health = Health(NAME, at=(config.run or folder.name, 0, 0))
     with (Server(config.viewer) as server,
           closing(ZenohBus(config.bus.endpoint, world=config.bus.world, onlooker=True)) as bus,

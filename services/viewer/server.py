@@ -20,7 +20,7 @@ from pathlib import Path
 from types import TracebackType
 
 from services.viewer.door import open_door
-from services.viewer.priority import step_back_session
+from services.viewer.priority import session_comes_last
 from shared.config import Config, ViewerConfig
 from shared.errors import SaccadeError
 
@@ -151,4 +151,4 @@ def _as_child() -> Callable[[], None] | None:
     if sys.platform != "linux":
         return None
     prctl = ctypes.CDLL(None).prctl
-    return lambda: (prctl(PR_SET_PDEATHSIG, signal.SIGKILL), step_back_session())
+    return lambda: (prctl(PR_SET_PDEATHSIG, signal.SIGKILL), session_comes_last())
