@@ -7,6 +7,7 @@ import re
 import signal
 import socket
 import subprocess
+import uuid
 from http.client import HTTPConnection
 from urllib.parse import parse_qs, urlsplit
 
@@ -200,7 +201,7 @@ def test_each_image_has_its_own_services_dependencies_alone(built):
 
 def test_a_changed_line_rebuilds_no_dependencies(built):
     core = built.folder / "services" / "belief" / "core.py"
-    core.write_text(core.read_text() + "\n# changed\n")
+    core.write_text(core.read_text() + f"\n# changed {uuid.uuid4()}\n")  # as it was never built before
     said = built("build", "--progress", "plain", "belief")
     installed = re.findall(r"^(#\d+) \[.*RUN .*pip install", said, re.M)
     assert len(installed) == 2
