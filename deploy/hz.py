@@ -86,8 +86,7 @@ def hz(key: str, *, log: Path | None, count: int | None, endpoint: str | None, r
         rates.take(heard.topic, heard.part, len(heard.payload), heard.time_ns / 1e9)
         if rates.total == count:
             break
-    for line in _lines(rates.rows(source.world)):
-        say(console, line)
+    _tell(console, rates, source.world)
     if source.reader.cut:
         say(console, source.reader.cut)
 
@@ -108,7 +107,7 @@ def follow(source: Live, count: int | None, console: Console) -> Rates:
     return rates
 
 
-def _tell(console: Console, rates: Rates, world: str, now_s: float) -> None:
+def _tell(console: Console, rates: Rates, world: str, now_s: float = -math.inf) -> None:
     for line in _lines(rates.rows(world, now_s)):
         say(console, line)
 

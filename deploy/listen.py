@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from deploy.supervisor import CONFIG_NAME
 from shared.bus import ZenohBus
-from shared.config import BusConfig, Config, load
+from shared.config import Config, load
 from shared.errors import SaccadeError
 from shared.process import Inbox
 from shared.reading import RunReader
@@ -158,16 +158,15 @@ def config_of(*, endpoint: str | None, run: Path | None) -> Config:
     if endpoint is not None:
         return Config().with_values({"bus.endpoint": endpoint})
     folder = run or newest_run()
-    bus_of(folder)
-    return load(folder / CONFIG_NAME).with_values({"run": folder.resolve().name})
+    return on_bus(folder).with_values({"run": folder.resolve().name})
 
 
-def bus_of(run: Path) -> BusConfig:
-    """The bus of a run's folder. Raises SaccadeError where it had none."""
-    bus = load(run / CONFIG_NAME).bus
-    if bus.kind != "zenoh" or bus.endpoint.endswith(":0"):
+def on_bus(run: Path) -> Config:
+    """The configuration in a run's folder. Raises SaccadeError where the run had no bus."""
+    config = load(run / CONFIG_NAME)
+    if config.bus.kind != "zenoh" or config.bus.endpoint.endswith(":0"):
         raise SaccadeError(f"run {run} was within one process and has no bus: give its log with --log")
-    return bus
+    return config
 
 
 def newest_run(runs: Path = RUNS) -> Path:
@@ -176,7 +175,7 @@ def newest_run(runs: Path = RUNS) -> Path:
         folders = sorted((path.stat().st_mtime_ns, path.parent) for path in runs.glob(f"*/{CONFIG_NAME}"))
         for _, folder in folders[:-NEWEST - 1:-1]:
             with suppress(SaccadeError):
-                if answers(bus_of(folder).endpoint):
+                if answers(on_bus(folder).bus.endpoint):
                     return folder
     raise SaccadeError(f"no run in {runs.absolute()} is on a bus now: give --endpoint, --run or --log")
 

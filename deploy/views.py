@@ -57,8 +57,9 @@ def picture(log: Log,
     from deploy.picture import draw
     from deploy.run import PICTURE_NAME
 
-    target = out or log_of(log).with_name(PICTURE_NAME)
-    draw(log_of(log), target, episode)
+    file = log_of(log)
+    target = out or file.with_name(PICTURE_NAME)
+    draw(file, target, episode)
     print(f"written to {target}")
 
 

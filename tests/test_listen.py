@@ -16,7 +16,7 @@ from rich.console import Console
 
 from deploy.echo import block, of_array, show
 from deploy.hz import Rates, follow
-from deploy.listen import Heard, Live, Logged, Wanted, bus_of, live, newest_run
+from deploy.listen import Heard, Live, Logged, Wanted, live, newest_run, on_bus
 from shared.bus import ZenohBus, free_endpoint
 from shared.config import Config
 from shared.errors import SaccadeError
@@ -213,7 +213,7 @@ def test_the_bus_of_a_run_and_of_the_newest_that_answers(bus, tmp_path):
         os.utime(tmp_path / name / "config.json", (i, i))
     (tmp_path / "broken").mkdir()
     (tmp_path / "broken" / "config.json").write_text("{")
-    assert bus_of(newest_run(tmp_path)).endpoint == bus.endpoint
+    assert on_bus(newest_run(tmp_path)).bus.endpoint == bus.endpoint
     with closing(live(Wanted.parse("frame"), endpoint=None, run=tmp_path / "old")) as source:
         assert source.world == "table"
     (tmp_path / "local").mkdir()

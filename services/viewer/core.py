@@ -35,13 +35,12 @@ WITHOUT = {  # what is not there to be seen without a topic
 
 @dataclass
 class Gathered:
-    """What has come of one step, by object. In lockstep steps follow one another; where a camera does not wait,
-    perception may be some steps behind it, beliefs behind perception."""
+    """Percepts or beliefs of one step, as far as they have come. In lockstep steps follow one another; where a camera
+    does not wait, perception may be some steps behind it, beliefs behind perception."""
 
     step: int = -1
     frame: Frame | None = None
-    percepts: dict[str, Percept] = field(default_factory=dict)
-    beliefs: dict[str, Belief] = field(default_factory=dict)
+    by_object: dict[str, Percept | Belief] = field(default_factory=dict)
 
 
 class Viewer:
@@ -112,7 +111,7 @@ class Viewer:
             self._first += self._newest + 1 if self._episode >= 0 else 0
             self._episode, self._newest, self._believed, self._said = episode, 0, {}, ""
             self._seen, self._held = Gathered(), Gathered()
-            self._to.set_time(STEP, sequence=self._first)
+            self._at(0)
             self._world.begin()
             self._images.begin()
         if episode == self._episode:
@@ -153,7 +152,7 @@ class Viewer:
             if self._seen.frame is not None:
                 self._images.frame(self._seen.frame)
         if percept.step == self._seen.step:
-            self._seen.percepts[percept.object] = percept
+            self._seen.by_object[percept.object] = percept
         width = self._seen.frame.rgb.shape[1] if self._seen.frame else IMAGE_SIZE_PX
         self._images.percept(percept, width)
 
@@ -163,7 +162,7 @@ class Viewer:
             self._held = Gathered(belief.step)
             self._at(belief.step)
         if belief.step == self._held.step:
-            self._held.beliefs[belief.object] = belief
+            self._held.by_object[belief.object] = belief
         self._believed[belief.object] = belief
         self._world.belief(belief)
 
@@ -173,13 +172,13 @@ class Viewer:
         if seen.frame is not None and time.monotonic() - self._drawn_s >= self._pause_s:
             self._drawn_s = time.monotonic()
             self._at(seen.step)
-            self._images.step(seen.frame, seen.percepts)
+            self._images.step(seen.frame, seen.by_object)
 
     def _draw_beliefs(self) -> None:
         held, self._held = self._held, Gathered(self._held.step)
-        if held.beliefs:
+        if held.by_object:
             self._at(held.step)
-            self._curves.beliefs(held.beliefs)
+            self._curves.beliefs(held.by_object)
 
     def _plan(self, plan: Plan) -> None:
         self._world.plan(plan)
