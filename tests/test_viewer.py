@@ -21,7 +21,7 @@ from services.viewer.world import PATH_LENGTH
 from shared.config import Config
 from shared.geometry import look_at
 from shared.reading import RunReader
-from shared.topics import BELIEF, FRAME, PERCEPT, PLAN, TRUTH
+from shared.topics import BELIEF, FRAME, PERCEPT, PLAN, STATUS, TRUTH
 from tests.fakes.logs import story, write
 from tests.fixtures.make import GOLDEN
 from tests.front_door import call
@@ -199,9 +199,12 @@ def test_what_is_kept_of_a_step_does_not_grow_with_the_run(tmp_path):
     for step in range(PATH_LENGTH + 100):
         camera = look_at((0.5, 0.0, 0.1 + step / 1e4), (0.0, 0.0, 0.0))
         viewer.take(FRAME, None, replace(frame, step=step, seq=step, world_from_camera=camera))
+    viewer.take(STATUS, "planner", sample(STATUS.type, service="planner", milliseconds=7.5))
     viewer.close()
     recording.disconnect()
-    paths = Seen(tmp_path / "run.rrd").of("/world/path", "LineStrips3D:strips")
+    seen = Seen(tmp_path / "run.rrd")
+    assert list(seen.numbers("/milliseconds/planner")) == [PATH_LENGTH + 99]
+    paths = seen.of("/world/path", "LineStrips3D:strips")
     assert [len(paths[step][0]) for step in (0, 9, PATH_LENGTH, PATH_LENGTH + 99)] == [1, 10, PATH_LENGTH, PATH_LENGTH]
     assert np.allclose(paths[PATH_LENGTH + 99][0][-1], camera[:3, 3], atol=1e-6)
 

@@ -141,6 +141,7 @@ class Viewer:
             oldest = self._frames.pop(min(self._frames))
             self._at(oldest.step)
             self._images.frame(oldest)
+            self._at(frame.step)  # what has no step of its own comes now
 
     def _percept(self, percept: Percept) -> None:
         """The images that perception left out are not shown: what was seen stands on the image it was seen in."""
