@@ -151,7 +151,7 @@ def test_a_running_episode_is_seen_and_moves(browser, tmp_path):
     late sees the run from its start."""
     port, data_port, another = (free_port("127.0.0.1") for _ in range(3))
     ARTEFACTS.mkdir(exist_ok=True)
-    with saccade("run", "--view", "--plain", "--count", "50", "--seed", "5", "--set", f"viewer.port={port}", "--set",
+    with saccade("run", "--view", "--plain", "--count", "2000", "--seed", "5", "--set", f"viewer.port={port}", "--set",
                  f"viewer.data_port={data_port}", "--set", "viewer.truth=true", "--out", tmp_path / "run") as run:
         page = Page(browser, port)
         first = page.until(empty)

@@ -126,7 +126,7 @@ def test_without_rerun_it_says_what_to_install(monkeypatch):
 @pytest.mark.parametrize("own_session", [True, False])
 def test_who_looks_on_comes_last_and_its_terminal_does_not(own_session):
     code = ("import os\nfrom services.viewer.priority import SESSION, come_last\n"
-            "def nice(): return SESSION.read_text().split()[-1] if SESSION.exists() else None\n"
+            "def nice(): return (SESSION.read_text().split() or [None])[-1] if SESSION.exists() else None\n"
             "before = nice()\ncome_last()\nprint(os.sched_getscheduler(0) == os.SCHED_IDLE, before, nice())")
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, start_new_session=own_session)
     idle, before, after = done.stdout.split()
