@@ -155,15 +155,15 @@ def test_a_running_episode_is_seen_and_moves(browser, tmp_path):
                  f"viewer.data_port={data_port}", "--set", "viewer.truth=true", "--out", tmp_path / "run") as run:
         page = Page(browser, port)
         first = page.until(empty)
+        page.until(lambda shot: [name for name in MOVES if np.abs(shot[name] - first[name]).max() < 48])
+        page.shot(ARTEFACTS / "viewer_live.png")
+        assert page.answered == {"127.0.0.1"}
+        page.page.close()  # it draws in software: beside it those who come last would be long in coming
+        late = recorded(data_port, tmp_path / "late.rrd")
         with saccade("view", "--live", "--truth", "--run", tmp_path / "run", "--port", another):
             assert until(lambda: listens("127.0.0.1", another))
             later = recorded(data_port_of(another), tmp_path / "later.rrd")
-        page.until(lambda shot: [name for name in MOVES if np.abs(shot[name] - first[name]).max() < 48])
-        page.shot(ARTEFACTS / "viewer_live.png")
         assert run.poll() is None  # that was while it ran
-        assert page.answered == {"127.0.0.1"}
-        page.page.close()
-        late = recorded(data_port, tmp_path / "late.rrd")
     assert (late, later) == ([], [])
 
 
