@@ -25,7 +25,7 @@ from tests.fixtures.make import GOLDEN
 from tests.test_viewer import Seen
 
 ARTEFACTS = REPOSITORY / "artefacts"
-WAIT_S = 120
+WAIT_S = 300
 FLAGS = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 SIZE = {"width": 1400, "height": 860}
 # left, top, right and bottom of what the layout puts there, as shares of the page
