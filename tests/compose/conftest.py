@@ -51,11 +51,18 @@ class Compose:
             time.sleep(0.5)
         return said
 
+    def until_ended(self, service: str, timeout_s: float = RUN_S) -> int:
+        """A container's exit code, at once where it has ended already. (`compose wait` knows running ones alone.)"""
+        return int(self._docker("wait", f"{self.project}-{service}-1", timeout_s=timeout_s))
+
     def inspect(self, service: str, number: int = 1) -> dict:
         """Docker's own words on a container."""
-        told = subprocess.run(["docker", "inspect", f"{self.project}-{service}-{number}"], text=True, check=True,
-                              capture_output=True).stdout
-        return json.loads(told)[0]
+        return json.loads(self._docker("inspect", f"{self.project}-{service}-{number}"))[0]
+
+    @staticmethod
+    def _docker(*arguments: str, timeout_s: float = RUN_S) -> str:
+        return subprocess.run(["docker", *arguments], text=True, check=True, capture_output=True,
+                              timeout=timeout_s).stdout
 
     def kill(self, service: str, number: int = 1) -> None:
         """All its processes but the first, whose end ends that one too. (A container that a user kills stays down.)"""

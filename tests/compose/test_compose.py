@@ -61,11 +61,10 @@ def test_the_run_can_be_seen_while_it_goes_on_and_for_a_while_after(compose):
     data, = parse_qs(urlsplit(sent.headers["Location"]).query)["url"]
     late = compose.folder / "late.rrd"
     with subprocess.Popen([binary(), "--save", late, data], stdout=subprocess.DEVNULL) as browser:
-        compose("wait", "viewer")
+        assert compose.until_ended("viewer") == 0
         browser.send_signal(signal.SIGINT)
     seen = {chunk.entity_path for chunk in RrdReader(late).stream().to_chunks()}
     assert {"/world/camera/image", "/world/candidates", "/crops/image", "/F", "/G", "/decisions"} <= seen
-    assert compose.inspect("viewer")["State"]["ExitCode"] == 0
     assert compose.log().complete
 
 
@@ -81,7 +80,7 @@ def test_a_killed_container_is_started_again_and_the_run_ends_as_it_would_have(c
     compose.until_said("episode 0 step 0")
     compose.kill(service)
     compose.until_said("log: runs/")
-    compose("wait", "recorder")
+    assert compose.until_ended("recorder") == 0
     assert compose.inspect(service)["RestartCount"] == 1
     assert compose.log().complete, list(compose.log().lines())
     assert [result.success for result in results(compose.run / "run.mcap")] == [True] * 3
@@ -101,7 +100,7 @@ def test_a_replica_that_dies_is_replaced_by_the_others(compose):
     compose.until_said("episode 0 step 0")
     compose.kill("perception", 2)
     compose.until_said("log: runs/")
-    compose("wait", "recorder")
+    assert compose.until_ended("recorder") == 0
     assert compose.log().complete, list(compose.log().lines())
     assert len(results(compose.run / "run.mcap")) == 3
 
@@ -162,7 +161,7 @@ def test_a_message_of_another_release_is_told_by_who_refuses_it(compose):
     said = compose.until_said("log: runs/")
     bus.close()
     assert said.count("saccade: simulator: refused: action: version: 2, not 1: it comes from another release") == 1
-    compose("wait", "recorder")
+    assert compose.until_ended("recorder") == 0
     assert [result.success for result in results(compose.run / "run.mcap")] == [True] * 3
 
 
