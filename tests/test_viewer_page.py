@@ -149,7 +149,9 @@ def share_unlike_background(pixels: np.ndarray) -> float:
 def test_a_running_episode_is_seen_and_moves(browser, tmp_path):
     """World, images, curves and words have content that changes from step to step; nobody else is heard of; who comes
     late sees the run from its start."""
-    port, data_port, another = (free_port("127.0.0.1") for _ in range(3))
+    port = free_port("127.0.0.1")
+    data_port = free_port("127.0.0.1", but=(port,))
+    another = free_port("127.0.0.1", but=(port, data_port))
     ARTEFACTS.mkdir(exist_ok=True)
     with saccade("run", "--view", "--plain", "--count", "2000", "--seed", "5", "--set", f"viewer.port={port}", "--set",
                  f"viewer.data_port={data_port}", "--set", "viewer.truth=true", "--out", tmp_path / "run") as run:

@@ -113,6 +113,7 @@ def test_a_port_that_is_taken_is_said_in_one_line():
         assert with_free_ports(config).viewer.port == free_port("127.0.0.1", port) > port
         with pytest.raises(SaccadeError, match=f"Rerun's server does not start on port {port}"):
             Server(configured(data_port=port))
+    assert configured(port=port, data_port=port).port > port  # the page and its data have two
     assert url_of(configured(address="0.0.0.0")).startswith("http://localhost:")
 
 

@@ -14,7 +14,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from importlib.util import find_spec
 from pathlib import Path
 from types import TracebackType
@@ -36,9 +36,9 @@ class Server:
 
     def __init__(self, config: ViewerConfig) -> None:
         self._home = tempfile.TemporaryDirectory(prefix="saccade-viewer-", ignore_cleanup_errors=True)
-        self.data_port = config.data_port or free_port(config.address)
+        self.data_port = config.data_port or free_port(config.address, but=(config.port,))
         self.address, self.url = config.address, url_of(config)
-        pages = free_port(config.address)
+        pages = free_port(config.address, but=(config.port, self.data_port))
         self._door = open_door(config, here(config.address), pages, self.data_port)
         self._child = self._start(config, pages)
         threading.Thread(target=self._door.serve_forever, name="door", daemon=True).start()
@@ -105,8 +105,9 @@ def with_free_ports(config: Config) -> Config:
     """The configuration with the ports that a viewer will have: its own, or the next that is free. Raises SaccadeError
     where none is."""
     viewer = config.viewer
-    return config.with_values({"viewer.port": free_port(viewer.address, viewer.port),
-                               "viewer.data_port": viewer.data_port or free_port(viewer.address)})
+    port = free_port(viewer.address, viewer.port, but=(viewer.data_port,))
+    return config.with_values({"viewer.port": port,
+                               "viewer.data_port": viewer.data_port or free_port(viewer.address, but=(port,))})
 
 
 def binary() -> str:
@@ -118,14 +119,17 @@ def binary() -> str:
     return str(path)
 
 
-def free_port(address: str, first: int | None = None) -> int:
-    """A port that is free now; with `first` that one, or the next after it. Raises SaccadeError where there is none."""
-    for port in [0] if first is None else range(first, min(first + PORTS, 65536)):
+def free_port(address: str, first: int | None = None, *, but: Collection[int] = ()) -> int:
+    """A port that is free now and none of `but`; with `first` that one, or the next after it. Raises SaccadeError where
+    there is none."""
+    reason = "others have them"
+    for port in [0] * PORTS if first is None else range(first, min(first + PORTS, 65536)):
         try:
             with socket.socket(socket.AF_INET6 if ":" in address else socket.AF_INET) as probe:
                 probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
                 probe.bind((address, port))
-                return probe.getsockname()[1]
+                if (found := probe.getsockname()[1]) not in but:
+                    return found
         except OSError as error:
             reason = error.strerror or str(error)
     raise SaccadeError(f"viewer: no port from {first or 0} on is free at {address}: {reason}")

@@ -9,6 +9,7 @@ import socket
 import subprocess
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -25,7 +26,7 @@ class Compose:
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.project = folder, f"saccade-test-{os.getpid()}"
-        self.port, self.view_port, view_data_port = free_port(), free_port(), free_port()
+        self.port, self.view_port, view_data_port = free_ports(3)
         self._environment = {name: value for name, value in os.environ.items() if not name.startswith("SACCADE_")}
         self._environment |= {"SACCADE_UID": str(USER), "SACCADE_GID": str(USER), "SACCADE_PORT": str(self.port),
                               "SACCADE_VIEW_PORT": str(self.view_port), "SACCADE_VIEW_DATA_PORT": str(view_data_port),
@@ -79,10 +80,13 @@ class Compose:
         return missing(self.run / world / "run.mcap")
 
 
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
+def free_ports(count: int) -> list[int]:
+    """Different ones: each is held until all are found."""
+    with ExitStack() as held:
+        probes = [held.enter_context(socket.socket()) for _ in range(count)]
+        for probe in probes:
+            probe.bind(("127.0.0.1", 0))
+        return [probe.getsockname()[1] for probe in probes]
 
 
 @pytest.fixture(scope="session")

@@ -24,6 +24,7 @@ from tests.fakes.camera import LENS_PX, film
 from tests.samples import sample
 
 SERVICES = ("router", "simulator", "perception", "belief", "planner", "evaluator", "recorder", "viewer")
+EPISODES = 10  # of a run in which something is done meanwhile: some seconds more than that takes
 
 
 def results(path) -> list:
@@ -76,14 +77,14 @@ def test_a_folder_that_docker_makes_is_given_to_the_services(compose):
 
 @pytest.mark.parametrize("service", ["perception", "simulator", "recorder", "router"])
 def test_a_killed_container_is_started_again_and_the_run_ends_as_it_would_have(compose, service):
-    compose("up", "--detach", SACCADE_COUNT="3")
+    compose("up", "--detach", SACCADE_COUNT=str(EPISODES))
     compose.until_said("episode 0 step 0")
     compose.kill(service)
     compose.until_said("log: runs/")
     assert compose.until_ended("recorder") == 0
     assert compose.inspect(service)["RestartCount"] == 1
     assert compose.log().complete, list(compose.log().lines())
-    assert [result.success for result in results(compose.run / "run.mcap")] == [True] * 3
+    assert [result.success for result in results(compose.run / "run.mcap")] == [True] * EPISODES
 
 
 def test_three_replicas_share_the_objects(compose):
@@ -96,13 +97,13 @@ def test_three_replicas_share_the_objects(compose):
 
 
 def test_a_replica_that_dies_is_replaced_by_the_others(compose):
-    compose("up", "--detach", "--scale", "perception=3", SACCADE_COUNT="3")
+    compose("up", "--detach", "--scale", "perception=3", SACCADE_COUNT=str(EPISODES))
     compose.until_said("episode 0 step 0")
     compose.kill("perception", 2)
     compose.until_said("log: runs/")
     assert compose.until_ended("recorder") == 0
     assert compose.log().complete, list(compose.log().lines())
-    assert len(results(compose.run / "run.mcap")) == 3
+    assert len(results(compose.run / "run.mcap")) == EPISODES
 
 
 def test_worlds_run_at_once(compose):
@@ -153,7 +154,7 @@ def test_a_second_simulator_is_refused_and_the_run_goes_on(compose):
 
 
 def test_a_message_of_another_release_is_told_by_who_refuses_it(compose):
-    compose("up", "--detach", SACCADE_COUNT="3")
+    compose("up", "--detach", SACCADE_COUNT=str(EPISODES))
     compose.until_said("episode 0 step 0")
     bus = ZenohBus(f"tcp/127.0.0.1:{compose.port}", world="table")
     action = encode(sample(ACTION.type))
@@ -162,7 +163,7 @@ def test_a_message_of_another_release_is_told_by_who_refuses_it(compose):
     bus.close()
     assert said.count("saccade: simulator: refused: action: version: 2, not 1: it comes from another release") == 1
     assert compose.until_ended("recorder") == 0
-    assert [result.success for result in results(compose.run / "run.mcap")] == [True] * 3
+    assert [result.success for result in results(compose.run / "run.mcap")] == [True] * EPISODES
 
 
 def test_missing_scans_are_told_by_the_simulator_alone(compose):
