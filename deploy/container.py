@@ -30,6 +30,7 @@ ONE_FOR_ALL = ("router", "viewer")  # worlds share the first, and the other show
 VIEW_VARIABLE, VIEW_S = "SACCADE_VIEW_S", 300.0  # for so long a run that is over can still be looked at
 POLL_S = 0.2
 ROUTER_S = 60.0  # for the router to answer: containers start in any order
+STOP_UNBEGUN_S = 3.0  # for a process that is told to stop before it has begun: what it waits for may not come any more
 EXIT_AGAIN = 1
 
 
@@ -129,10 +130,11 @@ class Container:
     def _end(self) -> None:
         for child in self._children.values():
             child.terminate()
-        end_s = time.monotonic() + STOP_S - 1  # Docker kills after STOP_S
-        for child in self._children.values():
+        told_s = time.monotonic()
+        for world, child in self._children.items():
+            for_s = STOP_S - 1 if heartbeat_file(world.name).exists() else STOP_UNBEGUN_S  # Docker kills after STOP_S
             try:
-                child.wait(max(0.1, end_s - time.monotonic()))
+                child.wait(max(0.1, told_s + for_s - time.monotonic()))
             except subprocess.TimeoutExpired:
                 child.kill()
                 child.wait()

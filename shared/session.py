@@ -18,7 +18,8 @@ from shared.wire import MAX_BYTES
 CONFIG_VARIABLE = "ZENOH_CONFIG"  # a file of Zenoh's settings to begin with: certificates, passwords, access
 # Publishers wait for whoever is slow: in lockstep a lost message would stop the world. Who only looks on is known to
 # the router by its session's id, one of these, and gets what fits into its queue: the rest is dropped, nobody waits.
-ONLOOKERS = tuple(f"{0x5accade0000 + k:x}" for k in range(1024))
+# They are drawn at random and so many that two hardly ever draw the same; the second would be refused.
+ONLOOKERS = tuple(f"{0x5accade0000 + k:x}" for k in range(1 << 14))
 QUEUE_BATCHES = 16  # of 64 KiB: a camera image fits in whole
 DROP_FOR_ONLOOKERS = {"id": "onlookers", "zids": ONLOOKERS, "messages": ["put"], "key_exprs": [f"{ROOT}/**"],
                       "flows": ["egress"], "overwrite": {"congestion_control": "drop"}}

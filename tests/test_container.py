@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
+import math
 import os
+import signal
 import subprocess
 import sys
 import time
 
 import pytest
 
-from deploy.container import LATEST, OVER, mine, worlds_of
+from deploy.container import LATEST, OVER, Container, mine, worlds_of
 from deploy.director import prepare
 from shared.config import REPOSITORY, Config
 from shared.errors import SaccadeError
@@ -75,6 +77,22 @@ def test_a_service_that_cannot_run_says_so_once_and_stays_down_until_the_run_is_
     (folder / OVER).touch()
     rest = process.communicate(timeout=30)[1]
     assert (process.returncode, rest) == (2, "")
+
+
+def test_who_is_stopped_before_it_has_begun_is_not_waited_for_long(tmp_path, monkeypatch):
+    """Such as one that waits for a router: its signal handler has no turn while Zenoh waits."""
+    prepare(Config(), 1, tmp_path)
+    monkeypatch.setenv("SACCADE_RUNS", str(tmp_path))
+    monkeypatch.setenv("SACCADE_HEARTBEATS", str(tmp_path / "beats"))
+    monkeypatch.setattr("deploy.container.STOP_S", math.inf)
+    monkeypatch.setattr("deploy.container.STOP_UNBEGUN_S", 0.1)
+    deaf = subprocess.Popen(["sh", "-c", "trap '' TERM; echo; while :; do sleep 0.1; done"], stdout=subprocess.PIPE)
+    assert deaf.stdout.readline() == b"\n"
+    container = Container("belief")
+    monkeypatch.setattr(container, "_start", lambda world: deaf)
+    container.stop()
+    assert container.run() == 0
+    assert deaf.returncode == -signal.SIGKILL
 
 
 @pytest.mark.parametrize(("files", "well"), [

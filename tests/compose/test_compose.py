@@ -124,6 +124,14 @@ def test_a_stopped_run_has_closed_its_log(compose):
     assert set(codes.values()) == {0}, codes  # 137: it was killed because it took more than 10 s
 
 
+def test_a_run_that_is_stopped_at_once_is_over_at_once(compose):
+    """Services that have only just begun obey too. (The viewer has what others leave of the processors: maybe none.)"""
+    compose("up", "--detach")
+    compose("stop")
+    codes = {name: compose.inspect(name)["State"]["ExitCode"] for name in SERVICES if name != "viewer"}
+    assert 137 not in codes.values(), codes
+
+
 def test_a_camera_stands_in_the_simulators_place(compose, tmp_path):
     for path in (tmp_path, *tmp_path.parents[:2]):
         path.chmod(0o755)
