@@ -23,13 +23,13 @@ app = typer.Typer(name="saccade", no_args_is_help=True, add_completion=False, pr
 app.add_typer(logs, name="log")
 app.add_typer(views)
 
-Objects = Annotated[Literal["pantry", "ycb"] | None, typer.Option(help="object set [default: pantry]")]
+Objects = Annotated[Literal["pantry", "ycb"] | None, typer.Option(help="object set", show_default="pantry")]
 Names = Annotated[str | None, typer.Option(help="only these objects of the set: a,b", metavar="NAMES")]
 ConfigFile = Annotated[Path | None, typer.Option(help="configuration, TOML or JSON; options go before it")]
 Values = Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE",
                                                   help="configuration by dotted key, e.g. planner.step_m=0.03")]
-WeightsFolder = Annotated[Path | None, typer.Option(help="folder of the weights [default: weights/<set>]")]
-Seed = Annotated[int | None, typer.Option(min=0, help="seed of everything random [default: 0]")]
+WeightsFolder = Annotated[Path | None, typer.Option(help="folder of the weights", show_default="weights/<set>")]
+Seed = Annotated[int | None, typer.Option(min=0, help="seed of everything random", show_default="0")]
 Yaw = Annotated[Literal["random", "fixed"] | None, typer.Option(help="whether drawn objects are turned")]
 ScenesFile = Annotated[Path | None, typer.Option(help="scenes file")]
 
@@ -41,16 +41,17 @@ def run(*, objects: Objects = None, names: Names = None, scenes: ScenesFile = No
         n_objects: Annotated[int | None, typer.Option(min=1, help="objects on the table")] = None, yaw: Yaw = None,
         goal: Annotated[Path | None, typer.Option(help="goal image, 480x480 PNG or JPEG")] = None,
         explore: Annotated[bool, typer.Option("--explore", help="no goal: find out what is there")] = False,
-        out: Annotated[Path | None, typer.Option(help="folder of the run [default: runs/<time>-<seed>]")] = None,
+        out: Annotated[Path | None, typer.Option(help="folder of the run", show_default="runs/<time>-<seed>")] = None,
         bus: Annotated[Literal["zenoh", "local"] | None, typer.Option(
-            help="services as processes on Zenoh, or all within this one [default: zenoh]")] = None,
+            help="services as processes on Zenoh, or all within this one", show_default="zenoh")] = None,
         agent: Annotated[str, typer.Option(help="which agent")] = "sceneccn", weights: WeightsFolder = None,
         world: Annotated[str, typer.Option(help="simulator, or camera: a real one")] = "simulator",
         source: Annotated[str | None, typer.Option(
             help="of a camera's images: a folder, a video file, or a webcam: webcam:0")] = None,
         poses: Annotated[Path | None, typer.Option(help="where the camera was: JSON lines or TUM")] = None,
         intrinsics: Annotated[str | None, typer.Option(help="of its images, in pixels", metavar="fx,fy,cx,cy")] = None,
-        rate: Annotated[float | None, typer.Option(help="images a second of a folder or webcam [default: 10]")] = None,
+        rate: Annotated[float | None, typer.Option(
+            help="images a second of a folder or webcam", show_default="10")] = None,
         loop: Annotated[bool, typer.Option("--loop", help="from the first image again after the last")] = False,
         config: ConfigFile = None, values: Values = None,
         view: Annotated[bool, typer.Option("--view", help="show it in a browser, see `saccade view`")] = False,
@@ -81,7 +82,7 @@ def replay(logs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="fo
            step: Annotated[bool, typer.Option("--step", help="one message for each key press")] = False,
            perception: Annotated[Path | None, typer.Option(
                help="other weights: a folder, or its name in weights/; tells what moved")] = None,
-           out: Annotated[Path | None, typer.Option(help="folder of the replay [default: replays/<time>]")] = None,
+           out: Annotated[Path | None, typer.Option(help="folder of the replay", show_default="replays/<time>")] = None,
            values: Values = None) -> None:
     """Play recorded inputs into services as they are now, log what they say, compare it with the recording.
 
@@ -101,15 +102,15 @@ def replay(logs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="fo
 @app.command()
 def bench(*, objects: Objects = None, scenes: ScenesFile = None,
           suite: Annotated[str | None, typer.Option(
-              help="paper-500, yaw-500, lexa-room, dev (for tuning) or paper-like "
-                   "[default: paper-500 for ycb, paper-like for pantry]")] = None,
+              help="paper-500, yaw-500, lexa-room, dev (for tuning) or paper-like",
+              show_default="paper-500 for ycb, paper-like for pantry")] = None,
           agent: Annotated[str, typer.Option(help="which agent")] = "sceneccn",
           limit: Annotated[int | None, typer.Option(min=1, help="only so many scenes, evenly chosen")] = None,
           jobs: Annotated[int, typer.Option(min=1, help="processes at a time")] = 1,
           cluster: Annotated[str | None, typer.Option(
               metavar="ADDRESS", help="a Ray cluster in place of --jobs: ray://host:10001")] = None,
           json: Annotated[Path | None, typer.Option(
-              help="file for the results [default: bench/<agent>_<set>[_<suite>].json]")] = None,
+              help="file for the results", show_default="bench/<agent>_<set>[_<suite>].json")] = None,
           yaw: Annotated[Literal["random", "fixed"] | None, typer.Option(
               help="the suite paper-like, drawn from --seed, its objects turned or not")] = None,
           seed: Seed = None, weights: WeightsFolder = None, config: ConfigFile = None, values: Values = None) -> None:
@@ -151,12 +152,12 @@ def report(*, results: Annotated[list[Path], typer.Argument(
 @app.command()
 def train(*, objects: Objects = None, names: Names = None,
           out: Annotated[Path | None, typer.Option(
-              help="folder of the training [default: training_runs/<set>]")] = None,
+              help="folder of the training", show_default="training_runs/<set>")] = None,
           steps_ccn: Annotated[int | None, typer.Option(min=1, help="steps of each object's networks")] = None,
           steps_extraction: Annotated[int | None, typer.Option(min=1, help="steps of the network for all")] = None,
           views: Annotated[int | None, typer.Option(min=20, max=5000, help="views of each object")] = None,
           seed: Seed = None, jobs: Annotated[int, typer.Option(min=1, help="networks at a time")] = 1,
-          device: Annotated[Literal["auto", "cpu", "cuda"] | None, typer.Option(help="[default: auto]")] = None,
+          device: Annotated[Literal["auto", "cpu", "cuda"] | None, typer.Option(show_default="auto")] = None,
           architecture: Annotated[Literal["default", "paper"], typer.Option(
               help="our networks, or those of the paper's tables; theirs go to folders named <set>-paper")] = "default",
           weights: WeightsFolder = None, values: Annotated[list[str] | None, typer.Option(
@@ -212,12 +213,12 @@ def topics(world: Annotated[str, typer.Option(help="world, the second part of ev
     console.print(table, markup=False)
 
 
-Key = Annotated[str, typer.Argument(metavar="KEY", help="full key or topic[/part]; * stands for any")]
+Key = Annotated[str, typer.Argument(metavar="KEY", help="full key, topic or topic/part; * stands for any")]
 LogFile = Annotated[Path | None, typer.Option(help="a log, or a run's folder, instead of a bus", metavar="RUN")]
 Count = Annotated[int | None, typer.Option(min=1, help="end after so many messages")]
 Endpoint = Annotated[str | None, typer.Option(help="the bus, e.g. tcp/127.0.0.1:7447")]
 OfRun = Annotated[Path | None, typer.Option(
-    help="folder of a run that goes on, for its bus [default: the newest in runs/ that answers]", metavar="FOLDER")]
+    metavar="FOLDER", help="of a run that goes on, for its bus", show_default="the newest in runs/ that answers")]
 
 
 @app.command()

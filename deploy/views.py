@@ -23,13 +23,13 @@ def view(*, log: Annotated[Path | None, RUN] = None,
          truth: Annotated[bool, typer.Option(
              "--truth", help="also what the simulator alone knows: the goal's camera, objects as ghosts")] = False,
          port: Annotated[int | None, typer.Option(
-             min=1, max=65535, help="of the page [default: 9090 or the next that is free]")] = None,
+             min=1, max=65535, help="of the page", show_default="9090 or the next that is free")] = None,
          open_page: Annotated[bool, typer.Option("--open", help="open it in this machine's browser")] = False,
          run: Annotated[Path | None, typer.Option(
-             metavar="FOLDER", help="of a run that goes on [default: the newest in runs/ that answers]")] = None,
+             metavar="FOLDER", help="of a run that goes on", show_default="the newest in runs/ that answers")] = None,
          endpoint: Annotated[str | None, typer.Option(help="a bus instead, e.g. tcp/127.0.0.1:7447")] = None,
          weights: Annotated[Path | None, typer.Option(
-             help="that draw crops and views [default: the run's own, or weights/pantry]")] = None) -> None:
+             help="that draw crops and views", show_default="the run's own, or weights/pantry")] = None) -> None:
     """See it think: the table, beliefs, images and curves of a run in a browser; Ctrl-C ends it."""
     from rich.console import Console
 
@@ -50,8 +50,8 @@ def view(*, log: Annotated[Path | None, RUN] = None,
 
 @app.command()
 def picture(log: Log,
-            out: Annotated[Path | None, typer.Option(help="file [default: picture.png beside the log]")] = None,
-            episode: Annotated[int | None, typer.Option(min=0, help="which one [default: the last]")] = None) -> None:
+            out: Annotated[Path | None, typer.Option(help="file", show_default="picture.png beside the log")] = None,
+            episode: Annotated[int | None, typer.Option(min=0, help="which", show_default="the last")] = None) -> None:
     """Draw the picture of a run from its log once more."""
     from deploy.logs.source import log_of
     from deploy.picture import draw
@@ -65,7 +65,7 @@ def picture(log: Log,
 
 @app.command()
 def film(log: Log, out: Annotated[Path, typer.Argument(help="OUT.mp4 or OUT.gif", metavar="OUT")], *,
-         episode: Annotated[int | None, typer.Option(min=0, help="which one [default: the last]")] = None,
+         episode: Annotated[int | None, typer.Option(min=0, help="which one", show_default="the last")] = None,
          rate: Annotated[float, typer.Option(min=0.5, max=60, help="steps a second")] = 5.0) -> None:
     """Make a short film of an episode from its log: for a paper, a README."""
     from rich.console import Console

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import typer
 from rich.console import Console
 
 import deploy.cli as cli
@@ -76,6 +77,21 @@ def test_help_lists_the_commands(monkeypatch, capsys):
     assert code == 0
     for command in ("run", "bench", "report", "picture", "train", "doctor", "topics", "echo", "hz", "log"):
         assert f" {command} " in out
+
+
+def commands(group=None, path: tuple[str, ...] = ()) -> list[tuple[str, ...]]:
+    """Every command's words."""
+    group = group or typer.main.get_command(cli.app)
+    return [words for name, command in group.commands.items()
+            for words in (commands(command, (*path, name)) if hasattr(command, "commands") else [(*path, name)])]
+
+
+@pytest.mark.parametrize("words", commands(), ids=" ".join)
+def test_every_command_explains_itself(monkeypatch, capsys, words):
+    """Also where a text of ours could be taken for markup."""
+    code, out, _ = call(monkeypatch, capsys, *words, "--help")
+    assert code == 0
+    assert f"saccade {' '.join(words)} " in out
 
 
 def test_help_loads_nothing_heavy():

@@ -60,9 +60,9 @@ def recover(run: Run, out: Out) -> None:
 
 @app.command()
 def cut(run: Run, out: Out,
-        episode: Annotated[int | None, typer.Option(min=0, help="which one [default: the last]")] = None,
+        episode: Annotated[int | None, typer.Option(min=0, help="which one", show_default="the last")] = None,
         start: Annotated[int, typer.Option(min=0, help="first step")] = 0,
-        end: Annotated[int | None, typer.Option(min=0, help="last step [default: the last there is]")] = None) -> None:
+        end: Annotated[int | None, typer.Option(min=0, help="last step", show_default="the last")] = None) -> None:
     """Take some steps of an episode out of a log, as a log of their own."""
     from deploy.logs.check import missing
     from deploy.logs.cut import cut as cut_log
