@@ -74,9 +74,13 @@ class Container:
     def _start(self, world: Path) -> subprocess.Popen:
         environment = {**dict.fromkeys(VARIABLES, "1"), **KEEP_PAGES, ROUTER_WAIT_VARIABLE: str(ROUTER_S), **os.environ,
                        LAUNCHER_VARIABLE: str(os.getpid()),
-                       HEARTBEAT_VARIABLE: str(heartbeat_file(world.name))}
+                       HEARTBEAT_VARIABLE: str(self._heartbeat(world))}
         return subprocess.Popen([sys.executable, "-m", f"services.{self._name}", "--config", world / CONFIG_NAME],
                                 env=environment, start_new_session=True)
+
+    def _heartbeat(self, world: Path) -> Path:
+        """Of one of its own: other services may be on the same host, without containers."""
+        return heartbeat_file(f"{self._name}-{world.name}")
 
     def stop(self, *_: object) -> None:
         """Ends them; safe in a signal handler."""
@@ -120,7 +124,7 @@ class Container:
 
     def _hung(self) -> bool:
         for world, child in self._children.items():
-            file = heartbeat_file(world.name)
+            file = self._heartbeat(world)
             if child.poll() is None and file.exists() and time.time() - file.stat().st_mtime > HUNG_KILLED_S:
                 print(f"saccade: {self._name} hung for {HUNG_KILLED_S:.0f} s: it is ended", file=sys.stderr)
                 child.kill()
@@ -132,7 +136,7 @@ class Container:
             child.terminate()
         told_s = time.monotonic()
         for world, child in self._children.items():
-            for_s = STOP_S - 1 if heartbeat_file(world.name).exists() else STOP_UNBEGUN_S  # Docker kills after STOP_S
+            for_s = STOP_S - 1 if self._heartbeat(world).exists() else STOP_UNBEGUN_S  # Docker kills after STOP_S
             try:
                 child.wait(max(0.1, told_s + for_s - time.monotonic()))
             except subprocess.TimeoutExpired:

@@ -168,15 +168,22 @@ def plots(files: Sequence[Results], out: Path) -> list[str]:
 def conduct(files: Sequence[Results]) -> list[str]:
     """Steps, the agent's own word, and what a step costs."""
     lines = ["## Steps, the agent's own word, time", "",
-             "Declared: the agent said that it was there. A false alarm: it was not, when it first said so.", "",
-             "| results | median steps (interquartile range) | declared (%) | rightly, of those (%) | "
-             "false alarms, of all (%) | milliseconds per step |", "| --- | ---: | ---: | ---: | ---: | --- |"]
+             "Declared: the agent said that it was there. A false alarm: it was not, when it first said so. Episodes "
+             "that end at the goal, as the paper's do, tell of false alarms only; with `simulator.until=declared` they "
+             "end at the agent's word: reached is then the any-time success until it gave it.", "",
+             "| results | median steps (interquartile range) | reached (%) | declared (%) | rightly, of those (%) | "
+             "declared and right, of all (%) | false alarms, of all (%) | milliseconds per step |",
+             "| --- | ---: | ---: | ---: | ---: | ---: | ---: | --- |"]
     for file in files:
         row = rows(file.records)[-1]
-        rightly = "-" if row.declared_true is None else f"{100 * row.declared_true:.1f}"
+        own_word = file.facts["config"]["simulator"]["until"] == "declared"
+        rightly = row.declared_true if own_word else None
+        shares = [row.success.value, row.declared if own_word else None, rightly,
+                  None if rightly is None else row.declared * rightly, row.false_alarms]
+        said = " | ".join("-" if share is None else f"{100 * share:.1f}" for share in shares)
         spent = ", ".join(f"{name} {ms:.1f}" for name, ms in milliseconds(file.records).items()) or "-"
         lines.append(f"| {file.label} | {row.median_steps:g} ({row.middle_steps[0]:g} to {row.middle_steps[1]:g}) | "
-                     f"{100 * row.declared:.1f} | {rightly} | {100 * row.false_alarms:.1f} | {spent} |")
+                     f"{said} | {spent} |")
     return [*lines, ""]
 
 

@@ -44,10 +44,10 @@ def run(config: Config, *, agent: str, out: Path | None, plain: bool, console: C
         config = to_be_viewed(config)
     processes = agent_processes(agent, world, view=view) if config.bus.kind == "zenoh" else ()
     folder = _new_folder(out or Path("runs") / f"{time.strftime('%Y%m%d-%H%M%S')}-{config.seed}")
-    judged = not config.scene.explore and config.scene.goal_image is None
     ended = None  # of a run that was interrupted nothing stays to be looked at
     with ExitStack() as stack:
-        with Display(console, plain=plain, judged=judged, camera=place.source if place.live else None) as display:
+        with Display(console, plain=plain, judged=config.scene.goal_view_is_known,
+                     camera=place.source if place.live else None) as display:
             if view:
                 display.say(f"look at {url_of(config.viewer)}")
             try:

@@ -48,6 +48,11 @@ class SceneConfig(Section):
     goal_image: Path | None = None
     explore: bool = False
 
+    @property
+    def goal_view_is_known(self) -> bool:
+        """Whether the truth's goal pose is that of the goal image, so that a distance to it tells."""
+        return not self.explore and self.goal_image is None
+
 
 class SimulatorConfig(Section):
     """The paper's environment (section 4.1)."""

@@ -14,7 +14,7 @@ from rich.console import Console
 from deploy.bench import bench, prepare
 from deploy.failures import CLASSES, Diagnosis, Distance, diagnose, section
 from deploy.picture import Story
-from deploy.report import report, side_by_side, training
+from deploy.report import conduct, report, side_by_side, training
 from deploy.report_pictures import draw_exploration, explore, pick
 from deploy.rerun import prepare_again, read_results, replay, same_as
 from shared.config import REPOSITORY, Config
@@ -65,12 +65,20 @@ def test_numbers_and_pictures_of_a_small_file(tmp_path):
                      "0.231 ± 0.014 | 0.050 ± 0.000 | 0.067 ± 0.004 |")
     assert "| oracle, ycb, dev (floor) | 100.0 (20.7 to 100.0) | 0.100 | 0.200 | 0.050 |" in text
     assert "| paper: SceneCCN + AIF, its 500 scenes | 69.0 | 0.569 ± 0.034 | 0.231 ± 0.014 | 0.067 ± 0.004 |" in text
-    assert "| sceneccn, ycb, dev | 185 (17.5 to 350) | 75.0 | 66.7 | 25.0 | belief 20.0 |" in text
+    assert "| sceneccn, ycb, dev | 185 (17.5 to 350) | 50.0 | - | - | - | 25.0 | belief 20.0 |" in text
     assert "| sceneccn, ycb, dev | ours.json | 4 | ff | abc | 01234567 | P |" in text
     for name in ("errors", "objects", "steps"):
         assert f"(report/{name}.png)" in text
         with Image.open(tmp_path / "out" / "report" / f"{name}.png") as picture:
             assert min(picture.size) > 100
+
+
+def test_the_agents_own_word_is_counted_where_it_ends_the_episode(tmp_path):
+    """Of four it declares three, two of them rightly; in one of these it was there and had left again."""
+    config = Config().with_values({"simulator.until": "declared"}).model_dump(mode="json")
+    records = [record("a"), record("b"), record("c", declared_true=False), record("d", False, declared=False)]
+    row = conduct([read_results(write(tmp_path / "own.json", records, config=config))])[-2]
+    assert "| 75.0 | 75.0 | 66.7 | 50.0 | 25.0 |" in row
 
 
 def test_runs_of_the_same_scenes_are_compared_one_by_one(tmp_path):

@@ -98,10 +98,23 @@ def test_a_log_as_a_recording_has_everything_that_was_seen_believed_and_planned(
     assert "did not reach the goal" in seen.words()[-2]
 
 
-def test_what_the_simulator_alone_knows_is_shown_when_asked_for(monkeypatch, capsys, tmp_path):
+def test_where_things_truly_are_is_shown_when_asked_for(monkeypatch, capsys, tmp_path):
     seen, _ = saved(monkeypatch, capsys, tmp_path, GOLDEN)
     for entity in ("/world/true", "/world/goal"):
         assert seen.entities[entity] <= {"Clear:is_recursive"}
+    assert seen.numbers("/distance/true")  # how far off says no more than that
+
+
+@pytest.mark.parametrize("scene", [{"explore": True}, {"goal_image": "goal.png"}])
+def test_there_is_no_true_distance_to_a_goal_that_nobody_knows(tmp_path, scene):
+    recording = rr.RecordingStream("saccade")
+    recording.save(tmp_path / "run.rrd")
+    viewer = Viewer(recording, Config(scene={"names": NAMES, **scene}), truth=True, live=False)
+    viewer.take(TRUTH, None, sample(TRUTH.type, run="r", episode=0, step=0))
+    viewer.close()
+    recording.disconnect()
+    seen = Seen(tmp_path / "run.rrd")
+    assert "/world/true" in seen.entities
     assert not seen.numbers("/distance/true")
 
 

@@ -49,6 +49,7 @@ class Viewer:
 
     def __init__(self, recording: rr.RecordingStream, config: Config, *, truth: bool, live: bool) -> None:
         self._to, self._truth, self._names = recording, truth, list(config.scene.names or ())
+        self._goal_view_is_known = config.scene.goal_view_is_known
         self.lacks: list[str] = []
         recording.send_blueprint(layout(live=live, objects=len(self._names)))
         recording.set_time(STEP, sequence=0)
@@ -188,9 +189,10 @@ class Viewer:
         self._say(decision(plan, self._believed.values()))
 
     def _true(self, truth: Truth) -> None:
+        if self._goal_view_is_known:
+            self._curves.truth(truth)
         if self._truth:
             self._world.truth(truth)
-            self._curves.truth(truth)
 
     def _result(self, result: Result) -> None:
         self._finish()

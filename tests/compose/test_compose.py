@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import signal
 import socket
 import subprocess
 import uuid
 from http.client import HTTPConnection
+from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
 import pytest
@@ -16,6 +18,7 @@ from rerun.chunk import RrdReader
 
 from services.viewer.server import binary
 from shared.bus import ZenohBus
+from shared.config import load
 from shared.reading import RunReader
 from shared.topics import ACTION, PERCEPT, RESULT
 from shared.wire import encode
@@ -132,12 +135,11 @@ def test_a_run_that_is_stopped_at_once_is_over_at_once(compose):
     assert 137 not in codes.values(), codes
 
 
-def test_a_camera_stands_in_the_simulators_place(compose, tmp_path):
-    for path in (tmp_path, *tmp_path.parents[:2]):
-        path.chmod(0o755)
-    centers = film(tmp_path / "table.avi", tmp_path / "poses.jsonl", 12)
-    said = compose.up(COMPOSE_PROFILES="camera", SACCADE_SOURCE=str(tmp_path / "table.avi"),
-                      SACCADE_POSES=str(tmp_path / "poses.jsonl"), SACCADE_INTRINSICS=",".join(map(str, LENS_PX)))
+def test_a_camera_stands_in_the_simulators_place(compose):
+    """Its files are named as they lie in the folder of compose.yaml."""
+    centers = film(compose.folder / "table.avi", compose.folder / "poses.jsonl", 12)
+    said = compose.up(COMPOSE_PROFILES="camera", SACCADE_SOURCE="table.avi", SACCADE_POSES="poses.jsonl",
+                      SACCADE_INTRINSICS=",".join(map(str, LENS_PX)))
     assert all(f"found {name} at" in said for name in centers), said
     assert compose.log().complete, list(compose.log().lines())
 
@@ -149,7 +151,9 @@ def test_a_run_is_replayed_into_perception(compose):
 
 
 def test_other_weights_by_name(compose):
-    assert "reached the goal" in compose.up(SACCADE_PERCEPTION="pantry")
+    shutil.copytree(compose.folder / "weights" / "pantry", compose.folder / "weights" / "mine")
+    assert "reached the goal" in compose.up("--build", SACCADE_PERCEPTION="mine", timeout_s=BUILD_S)
+    assert load(compose.run / "config.json").perception.weights.name == "mine"
     compose("up", "--detach", SACCADE_PERCEPTION="nobodys")
     assert "/saccade/weights/nobodys/manifest.json are missing" in compose.until_said("saccade: ")
 
@@ -172,6 +176,14 @@ def test_a_message_of_another_release_is_told_by_who_refuses_it(compose):
     assert said.count("saccade: simulator: refused: action: version: 2, not 1: it comes from another release") == 1
     assert compose.until_ended("recorder") == 0
     assert [result.success for result in results(compose.run / "run.mcap")] == [True] * EPISODES
+
+
+def test_scans_are_mounted(compose):
+    scans = os.environ.get("SACCADE_YCB")
+    if scans is None:
+        pytest.skip("no YCB scans: set SACCADE_YCB to their folder")
+    assert "reached the goal" in compose.up(SACCADE_OBJECTS="ycb", SACCADE_YCB=str(Path(scans).resolve()))
+    assert compose.log().complete, list(compose.log().lines())
 
 
 def test_missing_scans_are_told_by_the_simulator_alone(compose):
