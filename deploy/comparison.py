@@ -22,7 +22,8 @@ At = tuple[str, str | None, int, int]  # topic, part, episode, step
 
 @dataclass(frozen=True)
 class Difference:
-    """One field of one message that is not as recorded. `size`: the largest |replayed - recorded| of its numbers."""
+    """One field of one message that is not as recorded. `size`: the largest |replayed - recorded| of its numbers; of
+    packed bits, the share of them that differs."""
 
     topic: str
     part: str | None
@@ -115,8 +116,11 @@ def _size(topic: str, name: str, old: Any, new: Any) -> tuple[float, bool]:
     """How far two values are apart, and whether that is tolerated."""
     if any(isinstance(v, (str, bool, list, type(None))) for v in (old, new)) or np.shape(old) != np.shape(new):
         return float("inf"), False
-    apart = np.abs(np.asarray(new, np.float64) - np.asarray(old, np.float64))
     allowed = tolerance_of(topic, name)
+    if allowed.flipped is not None:
+        share = float(np.unpackbits(old ^ new).mean())
+        return share, share <= allowed.flipped
+    apart = np.abs(np.asarray(new, np.float64) - np.asarray(old, np.float64))
     within = apart <= allowed.absolute + allowed.relative * np.abs(np.asarray(old, np.float64))
     return float(apart.max(initial=0.0)), bool(within.all())
 

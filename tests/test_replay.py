@@ -19,7 +19,7 @@ from deploy.tolerances import TOLERANCES, tolerance_of
 from shared.messages import field_types
 from shared.reading import RunReader
 from shared.recording import RunLog
-from shared.topics import ACTION, BELIEF, FRAME, PERCEPT, STATUS, TOPICS
+from shared.topics import ACTION, BELIEF, FRAME, GOAL_PERCEPT, PERCEPT, STATUS, TOPICS
 from shared.wire import encode
 from tests.fixtures.make import GOLDEN, IN_WORDS, WORDS, changes, in_words
 from tests.samples import sample
@@ -158,6 +158,27 @@ def test_differences_name_the_field_the_place_and_both_values():
     assert str(told["pixel"]) == "percept/mug episode 1 step 7: pixel: recorded [1] 1, replayed [1] 4"
     assert (told["pixel"].size, told["presence"].size) == (3.0, 0.25)
     assert [told[name].tolerated for name in ("pixel", "presence", "latent_std")] == [False, False, True]
+
+
+@pytest.mark.parametrize("topic", [PERCEPT, GOAL_PERCEPT])
+def test_a_mask_may_differ_in_a_few_cells_and_no_more(topic):
+    """Also one that is gone, or stands a cell beside where it was, is another mask."""
+    mask = np.zeros((60, 60), bool)
+    mask[20:34, 20:34] = True
+    outline = mask.copy()
+    outline[20, 20:24] = False
+
+    def found(other):
+        old, new = (sample(topic.type, episode=1, step=7, mask_bits=np.packbits(m, axis=1)) for m in (mask, other))
+        return list(differences(topic, "mug", old, new))
+
+    assert found(mask) == []
+    assert [(d.field, d.tolerated) for d in found(outline)] == [("mask_bits", True)]
+    for other in (~mask, np.zeros_like(mask), np.roll(mask, 1, axis=1)):
+        assert [(d.field, d.tolerated) for d in found(other)] == [("mask_bits", False)]
+    told, = found(~mask)
+    assert str(told) == f"{topic.name}/mug episode 1 step 7: mask_bits: recorded [0, 0] 0, replayed [0, 0] 255"
+    assert told.size == pytest.approx(60 / 64)
 
 
 def test_a_comparison_waits_for_both_and_tells_what_is_alone():
