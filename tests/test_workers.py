@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import signal
 import socket
@@ -11,9 +12,13 @@ import time
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
+from deploy.bench import bench, prepare
 from deploy.workers import in_processes
+from shared.config import Config
 from shared.errors import SaccadeError
+from tests.test_bench import timeless
 
 WORK = {f"scene {k}": (k,) for k in range(6)}
 INTERRUPTED = """
@@ -92,6 +97,17 @@ def test_a_cluster_does_the_same(cluster):
     assert dict(in_processes(square, WORK, 1, cluster)) == {f"scene {k}": (k * k, "1") for k in range(6)}
     with pytest.raises(SaccadeError, match=r"^scene a: no 3$"):
         list(in_processes(fails, {"a": (3,)}, 1, cluster))
+
+
+def test_a_benchmark_on_a_cluster_has_the_same_results(cluster, tmp_path):
+    """With no jobs here: whatever is done, is done there."""
+    def results(out, jobs, **where):
+        plan = prepare("oracle", Config(), tmp_path / out, limit=3)
+        return timeless(bench(plan, jobs=jobs, command="saccade bench", console=Console(file=io.StringIO()), **where))
+
+    here, there = results("here.json", 1), results("there.json", 0, cluster=cluster)
+    assert here == there
+    assert len({record["scene"] for record in here}) == 3
 
 
 def test_a_cluster_that_is_not_there_is_told(monkeypatch):
