@@ -193,32 +193,29 @@ def doctor() -> None:
     raise typer.Exit(examine())
 
 
-@app.command()
-def topics(world: Annotated[str, typer.Option(help="world, the second part of every key")] = "table") -> None:
-    """List what is on the bus: topics, keys, message types."""
-    from rich.console import Console
-    from rich.table import Table
-
-    from shared.topics import TOPICS
-
-    table = Table()
-    for header in ("topic", "key", "message", "how often", "what it is"):
-        table.add_column(header, no_wrap=header != "what it is")
-    for topic in TOPICS.values():
-        often = "once an episode" if topic.latched else "every step" if topic.in_step else "twice a second"
-        about = (topic.type.__doc__ or "").strip().split("\n")[0]
-        key = topic.key(world, "<part>" if topic.parts else None)
-        table.add_row(topic.name, key, topic.type.__name__, often, about)
-    wide(console := Console())
-    console.print(table, markup=False)
-
-
 Key = Annotated[str, typer.Argument(metavar="KEY", help="full key, topic or topic/part; * stands for any")]
 LogFile = Annotated[Path | None, typer.Option(help="a log, or a run's folder, instead of a bus", metavar="RUN")]
 Count = Annotated[int | None, typer.Option(min=1, help="end after so many messages")]
 Endpoint = Annotated[str | None, typer.Option(help="the bus, e.g. tcp/127.0.0.1:7447")]
 OfRun = Annotated[Path | None, typer.Option(
     metavar="FOLDER", help="of a run that goes on, for its bus", show_default="the newest in runs/ that answers")]
+
+
+@app.command()
+def topics(*, world: Annotated[str | None, typer.Option(
+               help="world, the second part of every key", show_default="the run's, or table")] = None,
+           log: LogFile = None,
+           live: Annotated[bool, typer.Option(
+               "--live", help="of a run that goes on; understood with --endpoint, --run or --seconds")] = False,
+           seconds: Annotated[int | None, typer.Option(
+               min=1, max=3600, help="how long to listen", show_default="2")] = None,
+           endpoint: Endpoint = None, run: OfRun = None) -> None:
+    """List what there is on the bus: topics, keys, message types; live or from a log, the keys and how much comes."""
+    from rich.console import Console
+
+    from deploy.topics import topics as list_topics
+
+    list_topics(world=world, log=log, on_bus=live, seconds=seconds, endpoint=endpoint, run=run, console=wide(Console()))
 
 
 @app.command()

@@ -89,18 +89,21 @@ class Live:
         """From now on until `stop`, with None now and then while nothing comes. What holds for the whole episode and
         was published before is asked for first."""
         self.listen(self._put)
-        earlier = self._bus.recall([topic for topic in self.wanted.topics if topic.latched])
         known = set()
-        for kept in earlier:
-            if self.wanted.matches(kept.topic, kept.part):
-                known.add(kept.payload)
-                yield Heard(kept.topic, kept.part, kept.payload, kept.published_ns)
+        for heard in self.earlier():
+            known.add(heard.payload)
+            yield heard
         while not self.inbox.stopping.is_set():
             item = self.inbox.get(TICK_S)
             if item is None:
                 yield None
             elif not item[0].latched or item[2] not in known:
                 yield Heard(*item, time.time_ns())
+
+    def earlier(self) -> list[Heard]:
+        """What holds for the whole episode and was published before, as its publishers know it."""
+        kept = self._bus.recall([topic for topic in self.wanted.topics if topic.latched])
+        return [Heard(k.topic, k.part, k.payload, k.published_ns) for k in kept if self.wanted.matches(k.topic, k.part)]
 
     def listen(self, deliver: Callable[[Topic, str | None, bytes], None]) -> None:
         """Calls `deliver` on the bus's thread for what is wanted; it must not wait."""

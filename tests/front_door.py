@@ -1,4 +1,4 @@
-"""The command `saccade` within this process."""
+"""The command `saccade` within this process, and what it prints."""
 
 from __future__ import annotations
 
@@ -16,3 +16,9 @@ def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, *argume
         cli.main()
     out, err = capsys.readouterr()
     return end.value.code or 0, out, err
+
+
+def rows(out: str) -> dict[str, list[str]]:
+    """The cells of a printed table by the first of their row."""
+    lines = ([cell.strip() for cell in line.split("│")[1:-1]] for line in out.splitlines() if line.startswith("│"))
+    return {first: cells for first, *cells in lines}

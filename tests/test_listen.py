@@ -1,4 +1,4 @@
-"""`echo` and `hz`: the messages of a bus or a log as text and as rates; who listens slowly harms nobody."""
+"""`echo`, `hz` and `topics`: messages of a bus or a log as text, as rates, by key; who listens slowly harms nobody."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ from rich.console import Console
 
 from deploy.echo import block, of_array, show
 from deploy.hz import Rates, follow
+from deploy.keys import Keys
 from deploy.listen import Heard, Live, Logged, Wanted, live, newest_run, on_bus
+from deploy.topics import survey
 from shared.bus import ZenohBus, free_endpoint
 from shared.config import Config
 from shared.errors import SaccadeError
@@ -24,7 +26,7 @@ from shared.outbox import Outbox
 from shared.topics import ACTION, FRAME, GOAL, GOAL_PERCEPT, PERCEPT, TOPICS, TRUTH
 from shared.wire import encode
 from tests.fakes.logs import story, write
-from tests.front_door import call
+from tests.front_door import call, rows
 from tests.samples import sample
 
 WAIT_S = 30
@@ -142,6 +144,15 @@ def test_rates_within_a_window():
     assert not math.isnan(uneven._rates[FRAME, None].values()[4])
 
 
+def test_gaps_of_what_came_live():
+    """It listens from somewhere on: what came before is not missing."""
+    keys, console = Keys(), Console(file=io.StringIO(), width=120)
+    for seq in (3, 4, 7):
+        keys.take(FRAME, None, 10, seq * 10**9, sample(FRAME.type, episode=1, step=seq, seq=seq))
+    console.print(keys.table("table"))
+    assert rows(console.file.getvalue()) == {"saccade/table/frame": ["Frame", "3", "30", "0.50", "1:3 to 1:7", "2"]}
+
+
 def test_echo_live_with_what_is_malformed(monkeypatch, capsys, bus):
     with Publishing(bus, (PERCEPT, "mug", encode(sample(PERCEPT.type))), (ACTION, None, b"junk")):
         code, out, err = call(monkeypatch, capsys, "echo", "*", "--endpoint", bus.endpoint, "--count", 4)
@@ -183,6 +194,41 @@ def test_what_holds_for_the_episode_is_asked_for(bus):
     with closing(Live(Wanted.parse("goal"), bus.endpoint, "table")) as source:
         assert show(source, 1, lines.append) == 1
     assert lines[0].startswith("saccade/table/goal  ")
+
+
+def test_topics_live(monkeypatch, capsys, bus):
+    """Also what was published before, and what is malformed."""
+    outbox, goal = Outbox(), sample(GOAL.type, run="r", episode=2, step=0)
+    bus.answer([GOAL], outbox.answer)
+    outbox.keep(GOAL, None, goal, encode(goal))
+    percept = encode(sample(PERCEPT.type, episode=2, step=7))
+    with Publishing(bus, (PERCEPT, "mug", percept), (ACTION, None, b"junk")):
+        code, out, err = call(monkeypatch, capsys, "topics", "--endpoint", bus.endpoint, "--seconds", 1)
+    assert (code, err) == (0, "")
+    found = rows(out)
+    assert list(found) == [f"saccade/table/{name}" for name in ("action", "goal", "percept/mug")]
+    assert found["saccade/table/goal"] == ["Goal", "1", f"{len(encode(goal)):,}", "", "2:0", "0"]
+    name, count, size, _, steps, gaps = found["saccade/table/percept/mug"]
+    assert (name, steps, gaps) == ("Percept", "2:7", "0")
+    assert int(size.replace(",", "")) == int(count.replace(",", "")) * len(percept)
+    assert found["saccade/table/action"][0::4] == ["Action", ""]
+
+
+def test_topics_of_the_run_that_goes_on_where_nobody_speaks(monkeypatch, capsys, bus, tmp_path):
+    Config().with_values({"bus.endpoint": bus.endpoint, "bus.world": "kitchen"}).save(tmp_path / "config.json")
+    with Publishing(bus, (ACTION, None, encode(sample(ACTION.type)))):
+        code, out, err = call(monkeypatch, capsys, "topics", "--live", "--run", tmp_path, "--seconds", 1)
+        assert (code, err) == (0, "")
+        assert out.startswith("nothing was heard in world 'kitchen': ")
+        out = call(monkeypatch, capsys, "topics", "--run", tmp_path, "--world", "table", "--seconds", 1)[1]
+    assert list(rows(out)) == ["saccade/table/action"]
+
+
+def test_ctrl_c_ends_topics_with_what_was_heard(bus):
+    with closing(Live(Wanted.parse("*"), bus.endpoint, "table")) as source:
+        press_ctrl_c()
+        assert survey(source, WAIT_S).found == {}
+        assert source.inbox.stopping.is_set()
 
 
 def test_a_slow_reader_drops_and_says_so_and_nobody_waits(bus):
@@ -230,6 +276,13 @@ def test_the_bus_of_a_run_and_of_the_newest_that_answers(bus, tmp_path):
     (("echo", "frame", "--run", "none", "--endpoint", "tcp/127.0.0.1:1"), "give one of them"),
     (("hz", "frame", "--log", "none"), "none cannot be read"),
     (("hz", "frame", "--endpoint", "nonsense"), "nonsense"),
+    (("topics", "--live"), "is on a bus now: give --endpoint, --run or --log"),
+    (("topics", "--run", "none"), "none/config.json cannot be read"),
+    (("topics", "--endpoint", "nonsense"), "nonsense"),
+    (("topics", "--live", "--world", "t b"), "is none of Saccade's"),
+    (("topics", "--log", "none"), "none cannot be read"),
+    (("topics", "--log", "none", "--live"), "--log is for a log"),
+    (("topics", "--log", "none", "--world", "table"), "--log is for a log"),
 ])
 def test_what_the_user_can_mend_is_one_line(monkeypatch, capsys, tmp_path, arguments, words):
     monkeypatch.chdir(tmp_path)

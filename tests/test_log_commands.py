@@ -1,6 +1,8 @@
-"""`saccade log`: what the commands print, with which exit code, and what a log that was cut says of itself."""
+"""`saccade log`, and `topics` of a log: what they print, with which exit code, and what a cut log says of itself."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import pytest
 
@@ -12,10 +14,11 @@ from shared.reading import RunReader
 from shared.recording import RunLog
 from shared.topics import ACTION, FRAME, GOAL, PERCEPT, RESULT, STATUS, TRUTH
 from shared.wire import encode
-from tests.front_door import call
+from tests.front_door import call, rows
 from tests.samples import sample
 
 STEPS = 6
+GOLDEN = Path(__file__).with_name("fixtures") / "golden.mcap"
 
 
 def story(episodes=2):
@@ -62,9 +65,8 @@ def test_info_tells_origin_episodes_and_keys(monkeypatch, capsys, run):
         for words in ("r7, world table", f"format {FORMAT}", "seed 3, commit abc", "x 1", "w 0123456789ab\n",
                       "mug reached in 6 steps", "episode 1: ", "saccade/table/percept/mug", "2023-11-14"):
             assert words in out
-    row = next(line for line in out.splitlines() if "table/frame" in line)
-    assert [cell.strip() for cell in row.split("│")][2] == "12"
-    assert [cell.strip() for cell in row.split("│")][-2] == "0"
+    row = rows(out)["saccade/table/frame"]
+    assert (row[1], row[-1]) == ("12", "0")
 
 
 def test_info_of_a_log_that_lacks_messages_and_its_end(monkeypatch, capsys, run, tmp_path):
@@ -73,9 +75,34 @@ def test_info_of_a_log_that_lacks_messages_and_its_end(monkeypatch, capsys, run,
     path.write_bytes(path.read_bytes()[:-4])
     code, out, _ = call(monkeypatch, capsys, "log", "info", path)
     assert code == 0
-    row = next(line for line in out.splitlines() if "table/frame" in line)
-    assert [cell.strip() for cell in row.split("│")][-2] == "1"
+    assert rows(out)["saccade/table/frame"][-1] == "1"
     assert "is cut or damaged" in out
+
+
+def test_topics_of_a_log(monkeypatch, capsys, run):
+    code, out, err = call(monkeypatch, capsys, "topics", "--log", GOLDEN)
+    sizes = {}
+    for topic, part, payload, _ in RunReader(GOLDEN).entries():
+        sizes.setdefault(topic.key("table", part), [topic.type.__name__]).append(len(payload))
+    found = rows(out)
+    assert (code, err) == (0, "")
+    assert list(found) == sorted(sizes)
+    for key, (name, *of_key) in sizes.items():
+        assert found[key][:3] == [name, str(len(of_key)), f"{sum(of_key):,}"]
+    assert [found[f"saccade/table/{name}"][4] for name in ("truth", "frame", "goal")] == [
+        "0:0 to 0:4", "0:0 to 0:3", "0:0"]
+    found = rows(call(monkeypatch, capsys, "topics", "--log", run)[1])
+    assert found["saccade/table/percept/mug"][4] == "0:0 to 1:5"
+    assert found["saccade/table/status/planner"][4] == ""  # belongs to no step
+
+
+def test_topics_of_a_log_that_is_cut_or_has_nothing(monkeypatch, capsys, run, tmp_path):
+    (tmp_path / "cut.mcap").write_bytes((run / "run.mcap").read_bytes()[:-4])
+    code, out, _ = call(monkeypatch, capsys, "topics", "--log", tmp_path / "cut.mcap")
+    assert code == 0
+    assert "is cut or damaged" in out
+    code, out, _ = call(monkeypatch, capsys, "topics", "--log", write(tmp_path / "none.mcap", []))
+    assert (code, out) == (0, f"log {tmp_path / 'none.mcap'} holds no message\n")
 
 
 def test_check_says_what_is_missing_by_its_exit_code_too(monkeypatch, capsys, run, tmp_path):

@@ -21,13 +21,13 @@ def info(run: Run) -> None:
     from rich.console import Console
 
     from deploy.cli import wide
-    from deploy.logs.info import gather, lines, table
+    from deploy.logs.info import gather, lines
     from deploy.logs.source import log_of
 
     told = gather(log_of(run))
     for line in lines(told):
         print(line)
-    wide(Console()).print(table(told), markup=False)
+    wide(Console()).print(told.keys.table(told.reader.world), markup=False)
 
 
 @app.command()

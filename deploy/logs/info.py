@@ -7,40 +7,16 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from rich.table import Table
-
+from deploy.keys import Keys
 from deploy.logs.cut import Range, range_of
 from deploy.logs.recover import RECOVERED
 from shared.messages import Result
 from shared.reading import RunReader
 from shared.sequences import Sequences
-from shared.topics import RESULT, TOPICS
+from shared.topics import RESULT
 from shared.wire import MessageError, decode
 
 SHORT = 12  # digits of a hash
-
-
-@dataclass
-class KeyInfo:
-    """The messages of one key: how many, their bytes, how many are missing, times of the first and the last (ns)."""
-
-    messages: int = 0
-    size: int = 0
-    gaps: int = 0
-    first_ns: int = 0
-    last_ns: int = 0
-
-    def take(self, size: int, time_ns: int) -> None:
-        """One more."""
-        self.first_ns = time_ns if not self.messages else min(self.first_ns, time_ns)
-        self.last_ns = max(self.last_ns, time_ns)
-        self.messages, self.size = self.messages + 1, self.size + size
-
-    @property
-    def rate_hz(self) -> float | None:
-        """Messages per second between the first and the last; None where there is no time between them."""
-        span_ns = self.last_ns - self.first_ns
-        return (self.messages - 1) * 1e9 / span_ns if span_ns > 0 else None
 
 
 @dataclass
@@ -49,7 +25,7 @@ class LogInfo:
 
     reader: RunReader
     file_size: int
-    keys: dict[str, KeyInfo] = field(default_factory=dict)
+    keys: Keys = field(default_factory=Keys)
     steps: dict[int, int] = field(default_factory=dict)
     results: dict[int, Result] = field(default_factory=dict)
     refused: int = 0
@@ -58,38 +34,33 @@ class LogInfo:
     @property
     def size(self) -> int:
         """Bytes of all messages."""
-        return sum(key.size for key in self.keys.values())
+        return sum(key.size for key in self.keys.found.values())
 
     @property
     def duration_s(self) -> float:
         """From the first message to the last."""
-        if not self.keys:
-            return 0.0
-        return (max(k.last_ns for k in self.keys.values()) - min(k.first_ns for k in self.keys.values())) / 1e9
+        found = self.keys.found.values()
+        return (max(key.last_ns for key in found) - min(key.first_ns for key in found)) / 1e9 if found else 0.0
 
 
 def gather(log: Path) -> LogInfo:
     """Reads a log whole. Raises SaccadeError if it is none."""
     reader = RunReader(log)
-    info, sequences = LogInfo(reader, log.stat().st_size), None
+    info = LogInfo(reader, log.stat().st_size)
     for topic, part, payload, time_ns in reader.entries():
-        sequences = sequences or Sequences(from_start=True, cut=range_of(reader) is not None)
-        key = topic.key(reader.world, part)
-        info.keys.setdefault(key, KeyInfo()).take(len(payload), time_ns)
+        if not info.keys.found:
+            info.keys = Keys(Sequences(from_start=True, cut=range_of(reader) is not None))
         try:
             message = decode(topic.type, payload)
         except MessageError:
+            message = None
             info.refused += 1
-            continue
-        missing = sequences.take(topic, part, message) or 0
-        if not topic.in_step:
-            info.keys[key].gaps += missing
+        info.keys.take(topic, part, len(payload), time_ns, message)
+        if message is None or not topic.in_step:
             continue
         info.steps[message.episode] = max(info.steps.get(message.episode, 0), message.step)
         if topic == RESULT:
             info.results[message.episode] = message
-    for (name, part), lost in sequences.missing.items() if sequences else ():
-        info.keys[TOPICS[name].key(reader.world, part)].gaps = lost
     info.kept = range_of(reader)
     return info
 
@@ -97,7 +68,7 @@ def gather(log: Path) -> LogInfo:
 def lines(info: LogInfo) -> Iterator[str]:
     """All but the table, a line each."""
     reader, run = info.reader, info.reader.metadata.get("run", {})
-    first_ns = min((key.first_ns for key in info.keys.values()), default=0)
+    first_ns = min((key.first_ns for key in info.keys.found.values()), default=0)
     began = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(first_ns / 1e9)) if first_ns else "never"
     yield f"log       {reader.path}"
     yield f"run       {run.get('run', 'unknown')}, world {reader.world or 'unknown'}, format {reader.format}"
@@ -118,18 +89,6 @@ def lines(info: LogInfo) -> Iterator[str]:
         yield f"{info.refused} entries are no valid messages"
     if reader.cut:
         yield reader.cut
-
-
-def table(info: LogInfo) -> Table:
-    """A row for each key."""
-    result = Table()
-    for header in ("key", "messages", "bytes", "per second", "mean bytes", "gaps"):
-        result.add_column(header, justify="left" if header == "key" else "right", no_wrap=True)
-    for name, key in sorted(info.keys.items()):
-        rate = "" if key.rate_hz is None else f"{key.rate_hz:.2f}"
-        result.add_row(name, f"{key.messages:,}", f"{key.size:,}", rate, f"{key.size / key.messages:,.0f}",
-                       str(key.gaps))
-    return result
 
 
 def _ending(steps: int | None, result: Result | None) -> str:
