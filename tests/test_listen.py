@@ -147,7 +147,7 @@ def test_rates_within_a_window():
 def test_gaps_of_what_came_live():
     """It listens from somewhere on: what came before is not missing."""
     keys, console = Keys(), Console(file=io.StringIO(), width=120)
-    for seq in (3, 4, 7):
+    for seq in (3, 7, 4):  # the last out of its turn
         keys.take(FRAME, None, 10, seq * 10**9, sample(FRAME.type, episode=1, step=seq, seq=seq))
     console.print(keys.table("table"))
     assert rows(console.file.getvalue()) == {"saccade/table/frame": ["Frame", "3", "30", "0.50", "1:3 to 1:7", "2"]}
@@ -155,9 +155,9 @@ def test_gaps_of_what_came_live():
 
 def test_echo_live_with_what_is_malformed(monkeypatch, capsys, bus):
     with Publishing(bus, (PERCEPT, "mug", encode(sample(PERCEPT.type))), (ACTION, None, b"junk")):
-        code, out, err = call(monkeypatch, capsys, "echo", "*", "--endpoint", bus.endpoint, "--count", 4)
+        code, out, err = call(monkeypatch, capsys, "echo", "*", "--endpoint", bus.endpoint, "--count", 60)
     assert (code, err) == (0, "")
-    assert out.count("saccade/table/") == 4
+    assert out.count("saccade/table/") == 60  # some come before all is subscribed to
     assert "saccade/table/action" in out
     assert "malformed: not msgpack" in out or "malformed: type" in out
     assert "  presence: 0.5\n" in out
