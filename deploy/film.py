@@ -111,7 +111,7 @@ def scenes(log: Path, episode: int) -> Iterator[tuple[Scene, Imagination | None]
         if not begun:
             config = validate(json.loads(reader.configuration or "{}"), f"the log {log}")
             imagination, begun = imagination_of(config), True
-            scene.story.goal_is_known = config.scene.goal_image is None and not config.scene.explore
+            scene.story.goal_is_known = config.scene.goal_view_is_known
         if not topic.in_step or message.episode != episode:
             continue
         if topic == FRAME and scene.story.last_rgb is not None:

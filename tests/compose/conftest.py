@@ -5,16 +5,15 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import socket
 import subprocess
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 
 from deploy.logs.check import Missing, missing
+from services.viewer.server import LOOPBACK, free_port
 from shared.config import REPOSITORY
 
 USER = 1000 if os.getuid() == 0 else os.getuid()
@@ -26,7 +25,9 @@ class Compose:
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.project = folder, f"saccade-test-{os.getpid()}"
-        self.port, self.view_port, view_data_port = free_ports(3)
+        self.port = free_port(LOOPBACK)
+        self.view_port = free_port(LOOPBACK, but=(self.port,))
+        view_data_port = free_port(LOOPBACK, but=(self.port, self.view_port))
         self._environment = {name: value for name, value in os.environ.items() if not name.startswith("SACCADE_")}
         self._environment |= {"SACCADE_UID": str(USER), "SACCADE_GID": str(USER), "SACCADE_PORT": str(self.port),
                               "SACCADE_VIEW_PORT": str(self.view_port), "SACCADE_VIEW_DATA_PORT": str(view_data_port),
@@ -78,15 +79,6 @@ class Compose:
     def log(self, world: str = ".") -> Missing:
         """What `saccade log check` finds."""
         return missing(self.run / world / "run.mcap")
-
-
-def free_ports(count: int) -> list[int]:
-    """Different ones: each is held until all are found."""
-    with ExitStack() as held:
-        probes = [held.enter_context(socket.socket()) for _ in range(count)]
-        for probe in probes:
-            probe.bind(("127.0.0.1", 0))
-        return [probe.getsockname()[1] for probe in probes]
 
 
 @pytest.fixture(scope="session")
