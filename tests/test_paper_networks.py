@@ -28,6 +28,8 @@ from shared.geometry import INTRINSICS_PX
 from shared.weights import MANIFEST, Weights
 from tests.fakes.training import assert_same_checkpoint, interrupt_and_resume
 from tests.fakes.weights import write_random_weights
+from training.ccn import goal_search_errors
+from training.checkpoints import ccn_of
 from training.dataset import load_views
 from training.paper_data import CleanViews, PaperFrames
 from training.part import Trainer
@@ -206,6 +208,31 @@ def test_phase_two_waits_for_phase_one(finished, tmp_path):
         Trainer(tmp_path, "soup_can.extraction")
 
 
+def test_phase_two_can_begin_with_the_ccns_of_other_weights(finished, weights, tmp_path):
+    config = TINY.model_copy(update={"ccns": str(weights.folder)})
+    assert config.parts == ("soup_can.extraction", "rice_box.extraction")
+    (tmp_path / "views").symlink_to(finished / "views")
+    train(tmp_path, config, jobs=2, console=Console(quiet=True))
+    export(tmp_path, tmp_path / "weights")
+    again = Weights(tmp_path / "weights")
+    for name in NAMES:
+        assert again.hashes[f"{name}.safetensors"] == weights.hashes[f"{name}.safetensors"]
+        assert again.manifest["losses"][name] == weights.manifest["losses"][name]
+    write_random_weights(tmp_path / "default", "pantry", NAMES)
+    with pytest.raises(SaccadeError, match="architecture 'default', not 'paper'"):
+        ccn_of(tmp_path, TINY.model_copy(update={"ccns": str(tmp_path / "default")}), "soup_can")
+
+
+def test_the_measure_of_a_ccn_asks_only_for_displacements_that_it_was_trained_on(finished):
+    """The paper's transition takes the azimuth as a number: beyond half a turn it has seen none."""
+    asked = []
+    ccn = CCN("paper").eval()
+    ccn.transition.register_forward_hook(lambda module, inputs, output: asked.append(inputs[1]))
+    clean = CleanViews(load_views(finished, "soup_can"), torch.device("cpu"))
+    goal_search_errors(ccn, clean, torch.arange(24), torch.Generator().manual_seed(0), pairs=8)
+    assert float(torch.cat(asked)[:, 0].abs().max()) <= np.pi + 1e-5
+
+
 def test_the_paper_has_its_own_defaults_and_ours_are_as_they_were():
     paper = TrainingConfig(names=NAMES, architecture="paper")
     assert (paper.batch_ccn, paper.rate_ccn, paper.batch_extraction, paper.rate_extraction) == (150, 5e-4, 100, 1e-4)
@@ -213,7 +240,7 @@ def test_the_paper_has_its_own_defaults_and_ours_are_as_they_were():
     assert TrainingConfig.model_validate_json(paper.model_dump_json()) == paper
     ours = TrainingConfig(names=NAMES)
     assert (ours.batch_ccn, ours.architecture, ours.needs("extraction")) == (32, "default", None)
-    assert {"architecture", "kl_extraction"}.isdisjoint(ours.model_dump(mode="json"))
+    assert {"architecture", "kl_extraction", "ccns"}.isdisjoint(ours.model_dump(mode="json"))
     assert TrainingConfig.model_validate_json(ours.model_dump_json()) == ours
 
 

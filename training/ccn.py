@@ -29,6 +29,11 @@ class Pair:
     displacement: Tensor
 
 
+def wrapped(angle: Tensor) -> Tensor:
+    """Angles in [-pi, pi): the only ones that the paper's transition has seen."""
+    return torch.remainder(angle + torch.pi, 2 * torch.pi) - torch.pi
+
+
 def sample_pair(composer: CropComposer, train_index: Tensor, batch: int, generator: torch.Generator, *,
                 clean: bool = False) -> Pair:
     """Random pairs of the training directions, composed; or `clean`, as they were rendered."""
@@ -37,7 +42,7 @@ def sample_pair(composer: CropComposer, train_index: Tensor, batch: int, generat
         return train_index[chosen]
 
     i, j = pick(), pick()
-    azimuth = (composer.azimuth[j] - composer.azimuth[i] + np.pi) % (2 * np.pi) - np.pi
+    azimuth = wrapped(composer.azimuth[j] - composer.azimuth[i])
     displacement = torch.stack([azimuth, composer.elevation[j] - composer.elevation[i]], dim=1)
     if clean:
         return Pair(composer.undisturbed(i), composer.undisturbed(j), displacement)
@@ -112,7 +117,7 @@ def goal_search_errors(ccn: CCN, composer: CropComposer, held_out: Tensor, gener
     grid_e, grid_a = torch.meshgrid(elevation, azimuth, indexing="ij")
     result = np.empty(pairs)
     for n in range(pairs):
-        move = torch.stack([grid_a.flatten() - composer.azimuth[i[n]].cpu(),
+        move = torch.stack([wrapped(grid_a.flatten() - composer.azimuth[i[n]].cpu()),
                             grid_e.flatten() - composer.elevation[i[n]].cpu()], dim=1).to(composer.device)
         moved_mean, moved_std = ccn.transition(mean[n].expand(len(move), -1), move)
         score = log_density(goal_mean[n], moved_mean, (moved_std ** 2 + goal_std[n] ** 2).sqrt())

@@ -7,9 +7,10 @@ from pathlib import Path
 
 from safetensors import safe_open
 from safetensors.torch import load_file
-from torch import Tensor
+from torch import Tensor, from_numpy
 
 from shared.errors import SaccadeError
+from shared.weights import Weights
 from training.settings import TrainingConfig
 
 CHECKPOINT = "checkpoint.safetensors"
@@ -39,3 +40,18 @@ def finished(run_dir: Path, config: TrainingConfig, part: str) -> tuple[dict, di
     if facts["step"] != config.steps(part):
         raise SaccadeError(f"{part} is at step {facts['step']} of {config.steps(part)}: finish the training first")
     return facts, model_of(tensors)
+
+
+def ccn_of(run_dir: Path, config: TrainingConfig, name: str) -> tuple[dict, dict[str, Tensor]]:
+    """What the manifest says of an object's finished CCN, and its tensors: of this run, or of the weights that
+    `config.ccns` names. Raises SaccadeError where there is none."""
+    if config.ccns is None:
+        return finished(run_dir, config, name)
+    weights = Weights(Path(config.ccns))
+    if weights.architecture != config.architecture:
+        raise SaccadeError(f"weights {weights.folder} are of the architecture {weights.architecture!r}, not "
+                           f"{config.architecture!r}: name others (ccns)")
+    weights.cards_of((name,))
+    told = weights.manifest
+    facts = {"commit": told.get("commits", {}).get(name, "unknown"), "losses": told.get("losses", {}).get(name, {})}
+    return facts, {key: from_numpy(array) for key, array in weights.state(name).items()}

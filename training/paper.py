@@ -11,7 +11,8 @@ from torch import Tensor, nn
 from services.perception.paper import PaperExtraction
 from services.simulator.views import ObjectViews
 from shared.generative_model import CCN, kl_divergence
-from training.ccn import loss_l1, sample_pair
+from shared.windows import CROP_PX
+from training.ccn import loss_l1, sample_pair, wrapped
 from training.extraction import HIDDEN, SEEN, errors
 from training.frames import FrameBatch
 from training.paper_data import CleanViews, PaperFrames
@@ -20,7 +21,10 @@ from training.settings import TrainingConfig
 from training.tasks import CcnTask, generator_of, split
 
 KL_TRANSITION = 10.0  # lambda_4 (table of optimisation)
-MASKING, CROPPING, IDENTIFICATION = 10.0, 10.0, 10.0
+MASKING, CROPPING, IDENTIFICATION = 10.0, 10.0, 10.0  # of errors summed over 64 x 64 x 3, as those of phase 1 are
+SUMMED = 3 * CROP_PX ** 2
+KL_FROM = 0.3  # of the steps: crops of nothing make for thousands of nats, and the mask learns to cut nothing out
+GUIDE_END = 0.1  # of the guide's weight is left at the end
 EVALUATED = 100  # images
 
 
@@ -46,7 +50,7 @@ class PaperExtractionTask:
     def __init__(self, config: TrainingConfig, views: list[ObjectViews], part: str, device: torch.device,
                  ccn: dict[str, Tensor]):
         torch.manual_seed(config.seed)
-        name = config.needs(part)
+        name = config.object_of(part)
         mine = next(v for v in views if v.name == name)
         self.clean = CleanViews(mine, device)
         self.frames = PaperFrames(mine, [v for v in views if v.name != name], device)
@@ -66,17 +70,18 @@ class PaperExtractionTask:
     def loss(self, step: int) -> tuple[Tensor, dict[str, float]]:
         generator, count = self.generator(step), self.config.batch_extraction
         first, second = (self._pick(self.train_index, count, generator) for _ in range(2))
-        batch = self.frames.compose(second, generator)
-        expected = self._expected(first, second, generator) if self.config.kl_extraction else None
+        batch, clean = self.frames.compose(second, generator), self.clean.clean(second)
+        done, config = step / self.config.steps_extraction, self.config
+        expected = self._expected(first, second, generator) if config.kl_extraction and done >= KL_FROM else None
+        guide = config.guide_extraction * GUIDE_END ** done
         with torch.autocast(self.device.type, dtype=torch.bfloat16):
-            return loss_l2(self.module, self.ccn, batch, self.clean.clean(second), expected, self.config)
+            return loss_l2(self.module, self.ccn, batch, clean, expected, kl=config.kl_extraction, guide=guide)
 
     @torch.no_grad()
     def _expected(self, first: Tensor, second: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """p(p' | p, a) of the views `second` [B], where p is drawn from what the clean views `first` [B] show."""
         mean, std = self.ccn.encoder(self.clean.clean(first))
-        azimuth = self.clean.azimuth[second] - self.clean.azimuth[first]
-        azimuth = torch.remainder(azimuth + torch.pi, 2 * torch.pi) - torch.pi
+        azimuth = wrapped(self.clean.azimuth[second] - self.clean.azimuth[first])
         displacement = torch.stack([azimuth, self.clean.elevation[second] - self.clean.elevation[first]], dim=1)
         noise = torch.randn(mean.shape, generator=generator, device=self.device)
         return self.ccn.transition(mean + std * noise, displacement)
@@ -98,12 +103,13 @@ class PaperExtractionTask:
 
 
 def loss_l2(network: PaperExtraction, ccn: CCN, batch: FrameBatch, clean: Tensor,
-            expected: tuple[Tensor, Tensor] | None, config: TrainingConfig) -> tuple[Tensor, dict[str, float]]:
+            expected: tuple[Tensor, Tensor] | None, *, kl: float, guide: float) -> tuple[Tensor, dict[str, float]]:
     """The masking, cropping and identification errors, and the KL terms of the latent that the crop gives: against the
     one `expected` after a displacement, and against a standard normal. What is not seen has neither crop nor latent.
 
-    `expected` is None where the KL terms weigh nothing. With `config.guide_extraction` the error of centre and log
-    scale counts too, which is not in the paper.
+    Squared errors are summed over pixels: with means the KL terms outweigh them, and the mask network learns to cut
+    nothing out. `expected` is None where the KL terms do not count. `guide` is the weight of the error of centre (in
+    half images) and log scale, which is not in the paper.
     """
     mask, center, scale, crop, logit = network(batch.image.contiguous(memory_format=torch.channels_last))
     visible = batch.visible[:, 0]
@@ -113,15 +119,15 @@ def loss_l2(network: PaperExtraction, ccn: CCN, batch: FrameBatch, clean: Tensor
     def mean_of_seen(values: Tensor) -> Tensor:
         return (values * seen).sum() / seen.sum().clamp(min=1.0)
 
-    masking = F.mse_loss(mask, batch.mask)
-    cropping = mean_of_seen(((crop[:, :3].float() - clean) ** 2).mean((1, 2, 3)))
+    masking = SUMMED * F.mse_loss(mask, batch.mask)
+    cropping = mean_of_seen(((crop[:, :3].float() - clean) ** 2).sum((1, 2, 3)))
     identification = (F.binary_cross_entropy_with_logits(logit, seen, reduction="none") * clear).mean()
     error = (center - (2 * batch.center[:, 0] - 1)).abs().sum(1) + (scale.log() - batch.log_scale[:, 0]).abs()
     loss = (MASKING * masking + CROPPING * cropping + IDENTIFICATION * identification
-            + config.guide_extraction * mean_of_seen(error))
+            + guide * mean_of_seen(error))
     parts = {"mask": masking, "crop": cropping, "presence": identification}
     if expected is not None:
         mean, std = ccn.encoder(crop[:, :3])
         parts["kl"] = mean_of_seen(kl_divergence(mean, std, *expected))
-        loss = loss + config.kl_extraction * (parts["kl"] + mean_of_seen(kl_divergence(mean, std, 0.0, 1.0)))
+        loss = loss + kl * (parts["kl"] + mean_of_seen(kl_divergence(mean, std, 0.0, 1.0)))
     return loss, {name: float(value.detach()) for name, value in parts.items()}

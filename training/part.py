@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from services.simulator.views import ObjectViews
 from shared.errors import SaccadeError
 from shared.provenance import commit
-from training.checkpoints import CHECKPOINT, finished, model_of, read_checkpoint
+from training.checkpoints import CHECKPOINT, ccn_of, model_of, read_checkpoint
 from training.dataset import load_views
 from training.paper import PaperCcnTask, PaperExtractionTask
 from training.settings import TrainingConfig, load_settings
@@ -54,7 +54,7 @@ def task_of(run_dir: Path, config: TrainingConfig, views: list[ObjectViews], par
         return (ExtractionTask if extraction else CcnTask)(config, views, part, device)
     if not extraction:
         return PaperCcnTask(config, views, part, device)
-    _, ccn = finished(run_dir, config, config.needs(part))
+    _, ccn = ccn_of(run_dir, config, config.object_of(part))
     return PaperExtractionTask(config, views, part, device, ccn)
 
 
@@ -70,7 +70,7 @@ class Trainer:
         extraction, paper = self.config.is_extraction(part), self.config.architecture == "paper"
         self.peak = self.config.rate_extraction if extraction else self.config.rate_ccn
         self.rate_at = constant_rate if paper else rate_at
-        self.steps, self.clip = self.config.steps(part), 5.0 if extraction else 5000.0
+        self.steps, self.clip = self.config.steps(part), 5.0 if extraction and not paper else 5000.0
         self.optimizer = torch.optim.Adam(self.task.module.parameters(), lr=self.peak,
                                           amsgrad=not (paper and extraction))
         self.step, self.seconds, self.smoothed, self.commit = 0, 0.0, {}, commit()

@@ -20,7 +20,7 @@ from services.simulator.views import crop_side_m
 from shared.config import REPOSITORY
 from shared.errors import SaccadeError
 from shared.weights import ObjectCard, write_weights
-from training.checkpoints import finished
+from training.checkpoints import ccn_of, finished
 from training.dataset import render_missing
 from training.part import pick_device
 from training.settings import EXTRACTION, TrainingConfig, load_settings
@@ -101,6 +101,10 @@ def export(run_dir: Path, weights_dir: Path) -> None:
         losses[part] = json.loads((run_dir / part / "losses.jsonl").read_text().splitlines()[-1])
         commits[part] = facts.get("commit", "unknown")
         seconds += facts["seconds"]
+    for name in config.names if config.ccns else ():
+        facts, states[name] = ccn_of(run_dir, config, name)
+        losses[name], commits[name] = facts["losses"], facts["commit"]
+        seconds += losses[name].get("seconds", 0.0)
     paper = config.architecture == "paper"
     sizes = {name: load_mesh(config.objects, name).size_m for name in config.names}
     cards = tuple(ObjectCard(name, size, CROP_SIDE_M if paper else crop_side_m(size)) for name, size in sizes.items())

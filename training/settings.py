@@ -14,7 +14,7 @@ from shared.weights import Architecture
 EXTRACTION = "extraction"
 # What holds for the paper's networks unless told otherwise: its batches and rates (appendix C), but fewer steps: its
 # 5,000 epochs of 450 views are 15,000 and 25,000.
-PAPER = {"steps_ccn": 5_000, "steps_extraction": 5_000, "batch_ccn": 150, "batch_extraction": 100,
+PAPER = {"steps_ccn": 5_000, "steps_extraction": 6_000, "batch_ccn": 150, "batch_extraction": 100,
          "rate_ccn": 5e-4, "rate_extraction": 1e-4}
 
 
@@ -23,9 +23,10 @@ class TrainingConfig(Section):
     CCNs see, views as wrong as the detector's crops or, for comparison, as they were rendered.
 
     `architecture` "paper": the paper's own networks, trained as it says; some settings then have other defaults.
-    `kl_extraction`: weight of the two KL terms in its phase 2; `guide_extraction`: of the error of centre and scale
-    themselves, which the paper leaves to the crop's error alone: with it fewer steps find the object. None of the
-    three is written where the architecture is "default".
+    `kl_extraction`: weight of the two KL terms in its phase 2, once they count; `guide_extraction`: weight at the start
+    of the error of centre and scale themselves, which the paper leaves to the crop's error alone: with it fewer steps
+    find the object. `ccns`: a folder of weights of these objects whose CCNs are taken as they are, so that phase 2
+    alone is trained. None of the four is written where the architecture is "default".
     """
 
     objects: Literal["pantry", "ycb"] = "pantry"
@@ -43,7 +44,8 @@ class TrainingConfig(Section):
     crops: Literal["as_detected", "clean"] = "as_detected"
     architecture: Architecture = "default"
     kl_extraction: float = Field(1.0, ge=0)
-    guide_extraction: float = Field(0.0, ge=0)
+    guide_extraction: float = Field(300.0, ge=0)
+    ccns: str | None = None
 
     @model_validator(mode="before")
     @classmethod
@@ -54,14 +56,14 @@ class TrainingConfig(Section):
     def _tree(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
         tree = handler(self)
         if self.architecture == "default":
-            del tree["architecture"], tree["kl_extraction"], tree["guide_extraction"]
+            del tree["architecture"], tree["kl_extraction"], tree["guide_extraction"], tree["ccns"]
         return tree
 
     @property
     def parts(self) -> tuple[str, ...]:
         """The networks that are trained: one process each."""
         if self.architecture == "paper":
-            return (*self.names, *(f"{name}.{EXTRACTION}" for name in self.names))
+            return (*(() if self.ccns else self.names), *(f"{name}.{EXTRACTION}" for name in self.names))
         return (EXTRACTION, *self.names)
 
     def is_extraction(self, part: str) -> bool:
@@ -70,8 +72,12 @@ class TrainingConfig(Section):
 
     def needs(self, part: str) -> str | None:
         """The part that has to be finished before this one begins: the paper freezes an object's CCN in phase 2."""
-        name, _, phase = part.rpartition(".")
-        return name if name and phase == EXTRACTION else None
+        name = self.object_of(part)
+        return name if name != part and not self.ccns else None
+
+    def object_of(self, part: str) -> str:
+        """The object of a part of the paper's: NAME or NAME.extraction."""
+        return part.removesuffix(f".{EXTRACTION}")
 
     def steps(self, part: str) -> int:
         """Steps of one part."""
