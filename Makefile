@@ -23,7 +23,7 @@ lint: .venv/.installed-dev
 	.venv/bin/lint-imports
 
 fixtures: .venv/.installed-dev
-	.venv/bin/python -m tests.fixtures.make
+	.venv/bin/python -m saccade.tests.fixtures.make
 
 bench: .venv/.installed
 	$(SACCADE) bench --objects pantry --jobs 2 --json bench/pantry.json

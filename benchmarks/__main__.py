@@ -19,17 +19,17 @@ from rich.console import Console
 from rich.table import Table
 from torch.utils.flop_counter import FlopCounterMode
 
-from services.perception.core import SceneCCN
-from services.perception.seen import Seen
-from services.planner.free_energy import expected_free_energy
-from services.planner.goal import Preference
-from shared.config import REPOSITORY
-from shared.generative_model import Encoder, Stacked
-from shared.geometry import GRID_AZIMUTHS, GRID_ELEVATIONS, IMAGE_SIZE_PX, INTRINSICS_PX
-from shared.messages import Belief, Frame
-from shared.weights import Weights
-from shared.windows import CROP_PX
-from shared.wire import decode, encode
+from saccade.services.perception.core import SceneCCN
+from saccade.services.perception.seen import Seen
+from saccade.services.planner.free_energy import expected_free_energy
+from saccade.services.planner.goal import Preference
+from saccade.shared.bus.messages import Belief, Frame
+from saccade.shared.bus.wire import decode, encode
+from saccade.shared.config import WEIGHTS
+from saccade.shared.model.generative_model import Encoder, Stacked
+from saccade.shared.model.weights import Weights
+from saccade.shared.world.geometry import GRID_AZIMUTHS, GRID_ELEVATIONS, IMAGE_SIZE_PX, INTRINSICS_PX
+from saccade.shared.world.windows import CROP_PX
 
 
 def milliseconds(work: Callable[[], object], repetitions: int = 9) -> float:
@@ -55,7 +55,7 @@ def perception() -> list[dict]:
         one = one or together
         rows.append({"what": f"encode {count} objects", "ms": together, "of a loop": together / looped,
                      f"of {count} x one": together / (count * one)})
-    weights, one, rate = Weights(REPOSITORY / "weights" / "pantry"), 0.0, operations_per_ms()
+    weights, one, rate = Weights(WEIGHTS / "pantry"), 0.0, operations_per_ms()
     image = np.random.default_rng(0).integers(0, 256, (IMAGE_SIZE_PX, IMAGE_SIZE_PX, 3), dtype=np.uint8)
     for count in (1, 2, 5, 10, 20):
         model = SceneCCN(weights, (weights.names * 4)[:count])

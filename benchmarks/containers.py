@@ -1,4 +1,4 @@
-"""`python -m benchmarks.containers [out.json]`: steps per second of `docker compose up` with one, two and three
+"""`python -m saccade.benchmarks.containers [out.json]`: steps per second of `docker compose up` with one, two and three
 replicas of perception, and with and without shared memory between the containers; in turn, round after round."""
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ import yaml
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.rounds import in_turn
-from services.perception.core import SceneCCN
-from services.simulator.objects import names_of
-from shared.config import REPOSITORY
-from shared.geometry import INTRINSICS_PX
-from shared.reading import RunReader
-from shared.topics import TRUTH
-from shared.weights import Weights
+from saccade.benchmarks.rounds import in_turn
+from saccade.services.perception.core import SceneCCN
+from saccade.services.simulator.objects import names_of
+from saccade.shared.bus.topics import TRUTH
+from saccade.shared.config import PACKAGE, WEIGHTS
+from saccade.shared.log.reading import RunReader
+from saccade.shared.model.weights import Weights
+from saccade.shared.world.geometry import INTRINSICS_PX
 
 ROUNDS, SCENES, REPEATS = 3, 8, 60
 REPLICAS = (1, 2, 3)
@@ -34,7 +34,7 @@ PROJECT = f"saccade-bench-{os.getpid()}"
 def compose(*arguments: str) -> None:
     environment = {**os.environ, "SACCADE_COUNT": str(SCENES), "SACCADE_SEED": "3", "SACCADE_PORT": "0",
                    "SACCADE_VIEW_S": "0"}
-    subprocess.run(["docker", "compose", "-p", PROJECT, *arguments], cwd=REPOSITORY, env=environment, check=True,
+    subprocess.run(["docker", "compose", "-p", PROJECT, *arguments], cwd=PACKAGE, env=environment, check=True,
                    stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
 
@@ -43,7 +43,7 @@ def run(replicas: int, files: tuple[str, ...] = ()) -> float:
     chosen = [argument for name in files for argument in ("-f", name)]
     compose(*chosen, "up", "--scale", f"perception={replicas}")
     compose(*chosen, "down", "--volumes")
-    entries = RunReader(REPOSITORY / "runs" / "latest" / "run.mcap").entries()
+    entries = RunReader(PACKAGE / "runs" / "latest" / "run.mcap").entries()
     truths_ns = [entry.log_time_ns for entry in entries if entry.topic == TRUTH]
     return (len(truths_ns) - 1) / (truths_ns[-1] - truths_ns[0]) * 1e9
 
@@ -54,7 +54,7 @@ def perception_ms(objects: int) -> float:
 
     torch.set_num_threads(1)
     names, image = names_of("pantry")[:objects], np.random.default_rng(0).integers(0, 255, (480, 480, 3), np.uint8)
-    networks, spent_ms = SceneCCN(Weights(REPOSITORY / "weights" / "pantry"), names), []
+    networks, spent_ms = SceneCCN(Weights(WEIGHTS / "pantry"), names), []
     for _ in range(REPEATS):
         start = time.perf_counter()
         networks.see(image, INTRINSICS_PX, (0.0, 0.0, 1.0))
@@ -64,7 +64,7 @@ def perception_ms(objects: int) -> float:
 
 def without_shared_memory(folder: Path) -> str:
     """An override that gives every container a /dev/shm of its own."""
-    services = yaml.safe_load((REPOSITORY / "compose.yaml").read_text())["services"]
+    services = yaml.safe_load((PACKAGE / "compose.yaml").read_text())["services"]
     mounts = {name: [volume for volume in service["volumes"] if "bus-memory" not in volume]
               for name, service in services.items() if any("bus-memory" in v for v in service.get("volumes", ()))}
     lines = [f"  {name}:\n    volumes: !override {json.dumps(volumes)}" for name, volumes in mounts.items()]

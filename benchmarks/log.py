@@ -1,5 +1,5 @@
-"""`python -m benchmarks.log RUN.mcap [out.json]`: replaying a log as fast as can be into nothing, against the mcap
-library reading the same file; and the memory it takes on a log ten times as long."""
+"""`python -m saccade.benchmarks.log RUN.mcap [out.json]`: replaying a log as fast as can be into nothing, against
+the mcap library reading the same file; and the memory it takes on a log ten times as long."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from mcap.reader import make_reader
 from rich.console import Console
 from rich.table import Table
 
-from services.replayer.core import Keys, Pace, Selection, play
-from shared.reading import RunReader
-from shared.recording import RunLog
-from shared.topics import STATUS, TOPICS
-from shared.wire import decode, encode
+from saccade.services.replayer.core import Keys, Pace, Selection, play
+from saccade.shared.bus.topics import STATUS, TOPICS
+from saccade.shared.bus.wire import decode, encode
+from saccade.shared.log.reading import RunReader
+from saccade.shared.log.recording import RunLog
 
 ROUNDS, LONGER = 7, 10
 
@@ -51,8 +51,8 @@ def lengthened(log: Path, out: Path) -> None:
 
 def peak_mb(log: Path) -> float:
     """Memory of a process that replays the log into nothing."""
-    done = subprocess.run([sys.executable, "-m", "benchmarks.log", "--peak", log], capture_output=True, text=True,
-                          check=True)
+    done = subprocess.run([sys.executable, "-m", "saccade.benchmarks.log", "--peak", log], capture_output=True,
+                          text=True, check=True)
     return float(done.stdout)
 
 

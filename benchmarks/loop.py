@@ -1,5 +1,5 @@
-"""`python -m benchmarks.loop [out.json]`: closed-loop steps per second over the bus, with and without the recorder,
-against the same cores in one process; the same scenes, in turn, round after round."""
+"""`python -m saccade.benchmarks.loop [out.json]`: closed-loop steps per second over the bus, with and without the
+recorder, against the same cores in one process; the same scenes, in turn, round after round."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from pathlib import Path
 
 from rich.console import Console
 
-from benchmarks.rounds import compared, in_turn
-from deploy.launch import PROCESSES, launch
-from deploy.registry import local_pairs
-from shared.config import Config
-from shared.local import run_local
-from shared.topics import TRUTH
+from saccade.app.run.launch import PROCESSES, launch
+from saccade.app.run.registry import local_pairs
+from saccade.benchmarks.rounds import compared, in_turn
+from saccade.shared.bus.topics import TRUTH
+from saccade.shared.config import Config
+from saccade.shared.loop.local import run_local
 
 ROUNDS = 6
 CONFIG = Config().with_values({"seed": 3, "scene.names": ["coffee_can", "cereal_box", "rice_box", "soup_can",

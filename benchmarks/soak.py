@@ -1,5 +1,6 @@
-"""`python -m benchmarks.soak [minutes [out.json]]`: runs, one after the other, in which a process chosen by chance is
-killed every few seconds; counts what was lost. Each run's actions must be those of the run in one process, to the byte.
+"""`python -m saccade.benchmarks.soak [minutes [out.json]]`: runs, one after the other, in which a process chosen by
+chance is killed every few seconds; counts what was lost. Each run's actions must be those of the run in one process, to
+the byte.
 The exit code is 1 if anything was lost, said twice or done otherwise."""
 
 from __future__ import annotations
@@ -17,15 +18,15 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from deploy.launch import PROCESSES, launch
-from deploy.logs.check import missing
-from deploy.registry import local_pairs
-from shared.config import Config
-from shared.errors import SaccadeError
-from shared.local import run_local
-from shared.reading import RunReader
-from shared.topics import ACTION, STATUS
-from shared.wire import encode
+from saccade.app.log.check import missing
+from saccade.app.run.launch import PROCESSES, launch
+from saccade.app.run.registry import local_pairs
+from saccade.shared.bus.topics import ACTION, STATUS
+from saccade.shared.bus.wire import encode
+from saccade.shared.config import Config
+from saccade.shared.errors import SaccadeError
+from saccade.shared.log.reading import RunReader
+from saccade.shared.loop.local import run_local
 
 EVERY_S = (4.0, 10.0)  # between two kills
 EPISODES = 6
@@ -39,7 +40,7 @@ def child(name: str) -> int | None:
         try:
             if int(path.read_text().rsplit(")", 1)[1].split()[1]) != os.getpid():
                 continue
-            if f"services.{name}".encode() in (path.parent / "cmdline").read_bytes().split(b"\0"):
+            if f"saccade.services.{name}".encode() in (path.parent / "cmdline").read_bytes().split(b"\0"):
                 return int(path.parent.name)
         except OSError:
             continue

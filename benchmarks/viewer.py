@@ -1,6 +1,6 @@
-"""`python -m benchmarks.viewer [out.json]`: closed-loop steps per second without a viewer, with one that nobody uses,
-with a browser that looks, with one that is suspended, and with a viewer that is suspended; the same scenes, in turn,
-round after round. The browser draws in software, on the same processors, with what the agent leaves of them."""
+"""`python -m saccade.benchmarks.viewer [out.json]`: closed-loop steps per second without a viewer, with one that nobody
+uses, with a browser that looks, with one that is suspended, and with a viewer that is suspended; the same scenes, in
+turn, round after round. The browser draws in software, on the same processors, with what the agent leaves of them."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from pathlib import Path
 import psutil
 from rich.console import Console
 
-from benchmarks.loop import CONFIG, Clock
-from benchmarks.rounds import compared, in_turn
-from deploy.launch import launch
-from deploy.registry import agent_processes
-from deploy.supervisor import VIEWER
-from services.viewer.priority import come_last
-from services.viewer.server import url_of, with_free_ports
-from shared.topics import STATUS, TRUTH
+from saccade.app.run.launch import launch
+from saccade.app.run.registry import agent_processes
+from saccade.app.run.supervisor import VIEWER
+from saccade.benchmarks.loop import CONFIG, Clock
+from saccade.benchmarks.rounds import compared, in_turn
+from saccade.services.viewer.priority import come_last
+from saccade.services.viewer.server import url_of, with_free_ports
+from saccade.shared.bus.topics import STATUS, TRUTH
 
 ROUNDS = 4
 SUSPENDED_AT = 20  # views, after which a browser or viewer is suspended

@@ -1,4 +1,4 @@
-"""`python -m deploy.container SERVICE`: a service where something else starts and restarts it, such as Docker.
+"""`python -m saccade.deploy.container SERVICE`: a service where something else starts and restarts it, such as Docker.
 
 One process for each world of the newest run in SACCADE_RUNS, or for world number SACCADE_WORLD alone, until that run is
 over; the viewer shows the first of them and stays for SACCADE_VIEW_S seconds more. With SACCADE_WAIT set it waits until
@@ -17,11 +17,12 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from deploy.supervisor import CONFIG_NAME, HUNG_KILLED_S, KEEP_PAGES, STOP_S, VIEWER
-from deploy.threads import VARIABLES
-from shared.bus import ROUTER_WAIT_VARIABLE
-from shared.errors import SaccadeError
-from shared.process import EXIT_ERROR, HEARTBEAT_VARIABLE, LAUNCHER_VARIABLE
+from saccade.app.run.supervisor import HUNG_KILLED_S, KEEP_PAGES, STOP_S, VIEWER
+from saccade.app.run.threads import VARIABLES
+from saccade.shared.bus.transport import ROUTER_WAIT_VARIABLE
+from saccade.shared.errors import SaccadeError
+from saccade.shared.log.folder import CONFIG_NAME
+from saccade.shared.loop.process import EXIT_ERROR, HEARTBEAT_VARIABLE, LAUNCHER_VARIABLE
 
 RUNS_VARIABLE, HEARTBEATS_VARIABLE = "SACCADE_RUNS", "SACCADE_HEARTBEATS"
 WORLD_VARIABLE, WAIT_VARIABLE = "SACCADE_WORLD", "SACCADE_WAIT"
@@ -75,8 +76,8 @@ class Container:
         environment = {**dict.fromkeys(VARIABLES, "1"), **KEEP_PAGES, ROUTER_WAIT_VARIABLE: str(ROUTER_S), **os.environ,
                        LAUNCHER_VARIABLE: str(os.getpid()),
                        HEARTBEAT_VARIABLE: str(self._heartbeat(world))}
-        return subprocess.Popen([sys.executable, "-m", f"services.{self._name}", "--config", world / CONFIG_NAME],
-                                env=environment, start_new_session=True)
+        return subprocess.Popen([sys.executable, "-m", f"saccade.services.{self._name}", "--config",
+                                 world / CONFIG_NAME], env=environment, start_new_session=True)
 
     def _heartbeat(self, world: Path) -> Path:
         """Of one of its own: other services may be on the same host, without containers."""

@@ -1,5 +1,5 @@
-"""`python -m deploy.director`: prepares a run for services that something else starts, such as Docker; follows it and
-says how it ended.
+"""`python -m saccade.deploy.director`: prepares a run for services that something else starts, such as Docker; follows
+it and says how it ended.
 
 It writes the configuration of each world into a new folder in SACCADE_RUNS, which every service reads, and at the end a
 file that tells them that it is over.
@@ -23,20 +23,21 @@ from typing import Any
 
 from rich.console import Console
 
-from deploy.container import LATEST, OVER, ROUTER_S, heartbeat_file, runs_folder
-from deploy.display import LINE_EVERY, Progress, line, say
-from deploy.ending import ending
-from deploy.launch import LOG_NAME, Graph, follow, messages, resolve
-from deploy.options import configured, numbers, weights_folder
-from deploy.registry import DEFAULT_WORLD, WORLDS, agent_processes, world_of
-from deploy.supervisor import CONFIG_NAME, HUNG_S, Process
-from services.viewer.server import url_of
-from shared.bus import ZenohBus
-from shared.config import Config, load
-from shared.errors import SaccadeError
-from shared.messages import Message, Result
-from shared.process import EXIT_ERROR
-from shared.topics import BELIEF, FRAME, PLAN, RESULT, STATUS, TRUTH, Topic
+from saccade.app.cli.options import configured, numbers
+from saccade.app.run.display import LINE_EVERY, Progress, line, say
+from saccade.app.run.launch import Graph, follow, messages, resolve
+from saccade.app.run.registry import DEFAULT_WORLD, WORLDS, agent_processes, world_of
+from saccade.app.run.summary import summary
+from saccade.app.run.supervisor import HUNG_S, Process
+from saccade.deploy.container import LATEST, OVER, ROUTER_S, heartbeat_file, runs_folder
+from saccade.services.viewer.server import url_of
+from saccade.shared.bus.messages import Message, Result
+from saccade.shared.bus.topics import BELIEF, FRAME, PLAN, RESULT, STATUS, TRUTH, Topic
+from saccade.shared.bus.transport import ZenohBus
+from saccade.shared.config import Config, load, weights_folder
+from saccade.shared.errors import SaccadeError
+from saccade.shared.log.folder import CONFIG_NAME, LOG_NAME
+from saccade.shared.loop.process import EXIT_ERROR
 
 SHOWN = (PLAN, BELIEF, STATUS, RESULT)
 BEAT_S = 0.5
@@ -44,7 +45,7 @@ BEAT_S = 0.5
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Exit code 2, with one line, where the run cannot be prepared or does not come to its end."""
-    parser = argparse.ArgumentParser(prog="python -m deploy.director", description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(prog="python -m saccade.deploy.director", description=__doc__.splitlines()[0])
     parser.add_argument("--endpoint", default="tcp/127.0.0.1:7447", help="the router's address, for the services")
     parser.add_argument("--listen", help="where the router listens, if that is another one")
     parser.add_argument("--objects", default=None, help="object set: pantry, ycb")
@@ -136,7 +137,7 @@ def _follow(folder: Path, processes: Sequence[Process], console: Console, worlds
         elsewhere = Elsewhere([process.name for process in processes[1:]], tell)  # the router is the first world's
         graph = Graph(bus, elsewhere, messages(arrived, bus, elsewhere, config.run))
         results = follow(graph, processes, on_message)
-    for text in ending(config, results, progress):
+    for text in summary(config, results, progress):
         tell(text)
     tell(f"log: {Path(runs_folder().name) / folder.relative_to(runs_folder()) / LOG_NAME}")
     return results

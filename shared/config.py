@@ -9,10 +9,10 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
-from shared.errors import SaccadeError
+from saccade.shared.errors import SaccadeError
 
-REPOSITORY = Path(__file__).resolve().parent.parent
-PRESETS = REPOSITORY / "deploy" / "presets"
+PACKAGE = Path(__file__).resolve().parent.parent  # the folder of `saccade`: in a checkout the repository
+PRESETS, WEIGHTS = PACKAGE / "shared" / "presets", PACKAGE / "weights"
 
 
 class Section(BaseModel):
@@ -141,7 +141,7 @@ class Config(Section):
     def weights(self) -> Path:
         """The folder of the weights in use."""
         suffix = "" if self.perception.architecture == "default" else f"-{self.perception.architecture}"
-        return self.perception.weights or REPOSITORY / "weights" / f"{self.scene.objects}{suffix}"
+        return self.perception.weights or WEIGHTS / f"{self.scene.objects}{suffix}"
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -197,3 +197,11 @@ def load(path: Path | None) -> Config:
     except ValueError as error:
         raise SaccadeError(f"configuration {path} is neither TOML nor JSON: {error}") from error
     return validate(tree, str(path))
+
+
+def weights_folder(name: str | Path | None) -> Path | None:
+    """A folder of weights, or the one of that name among those that come with Saccade."""
+    if not name:
+        return None
+    path = Path(name)
+    return path if path.is_absolute() or path.is_dir() else WEIGHTS / path

@@ -3,7 +3,7 @@ Tests interrupt what they start, also where a shell has put them into the backgr
 
 import signal
 
-from deploy.threads import enforce_one_thread, limit_torch
+from saccade.app.run.threads import enforce_one_thread, limit_torch
 
 enforce_one_thread()
 limit_torch()

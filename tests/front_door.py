@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from deploy import cli
+from saccade.app.cli import main as cli
 
 
 def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, *arguments: object) -> tuple[int, str, str]:

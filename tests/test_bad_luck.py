@@ -5,18 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from deploy.registry import agent_pairs
-from services.evaluator import core as evaluator
-from services.perception.core import SceneCCN
-from services.simulator.core import SERVICE, Simulator
-from services.simulator.objects import load_mesh, names_of
-from services.simulator.scenes import Placed, generate_split
-from services.simulator.world import World
-from shared.config import REPOSITORY, Config
-from shared.geometry import look_at
-from shared.local import run_local
-from shared.task import START_RANGE_M, start_pose
-from shared.weights import Weights
+from saccade.app.run.registry import agent_pairs
+from saccade.services.evaluator import core as evaluator
+from saccade.services.perception.core import SceneCCN
+from saccade.services.simulator.core import SERVICE, Simulator
+from saccade.services.simulator.objects import load_mesh, names_of
+from saccade.services.simulator.scenes import Placed, generate_split
+from saccade.services.simulator.world import World
+from saccade.shared.config import WEIGHTS, Config
+from saccade.shared.loop.local import run_local
+from saccade.shared.model.weights import Weights
+from saccade.shared.world.geometry import look_at
+from saccade.shared.world.task import START_RANGE_M, start_pose
 
 NAMES = names_of("pantry")
 CONFIG = Config().with_values({"scene.names": list(NAMES), "scene.objects": "pantry", "bus.kind": "local"})
@@ -138,7 +138,7 @@ def test_a_goal_image_of_a_known_object_is_believed(agent, world, scenes, name):
 
 def test_objects_of_another_set_are_strangers(world):
     """The networks of the YCB objects see the goals of 40 pantry scenes: nine of ten are no object of theirs."""
-    weights = Weights(REPOSITORY / "weights" / "ycb")
+    weights = Weights(WEIGHTS / "ycb")
     model = SceneCCN(weights, weights.names)
     sizes = {name: load_mesh("pantry", name).size_m for name in NAMES}
     surest = []

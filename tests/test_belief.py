@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from services.belief.pose import GoalView
-from services.belief.position import PositionFilter, behind, beyond_nearest, evidence_of
-from shared.config import BeliefConfig
-from shared.generative_model import LATENT
-from shared.geometry import INTRINSICS_PX, direction, look_at, project, spherical, viewing_grid
-from shared.messages import Percept
-from shared.task import start_pose
+from saccade.services.belief.pose import GoalView
+from saccade.services.belief.position import PositionFilter, behind, beyond_nearest, evidence_of
+from saccade.shared.bus.messages import Percept
+from saccade.shared.config import BeliefConfig
+from saccade.shared.model.generative_model import LATENT
+from saccade.shared.world.geometry import INTRINSICS_PX, direction, look_at, project, spherical, viewing_grid
+from saccade.shared.world.task import start_pose
 
 TRUE = np.array([0.12, -0.08, 0.07])
 CONFIG = BeliefConfig(particles=3000)

@@ -12,19 +12,19 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-import deploy.bench as bench_module
-from deploy.bench import Plan, bench, prepare, run_scene, spread
-from deploy.launch import PROCESSES
-from deploy.registry import AGENTS, agent_pairs, agent_processes, local_pairs
-from deploy.suites import suite_file
-from deploy.table import PAPER, TOTAL, mean, milliseconds, render, rows, wilson
-from services.simulator.scenes import PAPER_SCENES, load_scenes
-from shared import provenance
-from shared.config import Config
-from shared.errors import SaccadeError
-from shared.local import run_local
-from shared.topics import ACTION, RESULT
-from tests.fakes.weights import write_random_weights
+import saccade.app.bench.bench as bench_module
+from saccade.app.bench.bench import Plan, bench, prepare, run_scene, spread
+from saccade.app.bench.suites import suite_file
+from saccade.app.bench.table import PAPER, TOTAL, mean, milliseconds, render, rows, wilson
+from saccade.app.run.launch import PROCESSES
+from saccade.app.run.registry import AGENTS, agent_pairs, agent_processes, local_pairs
+from saccade.services.simulator.scenes import PAPER_SCENES, load_scenes
+from saccade.shared.bus.topics import ACTION, RESULT
+from saccade.shared.config import Config
+from saccade.shared.errors import SaccadeError
+from saccade.shared.log import provenance
+from saccade.shared.loop.local import run_local
+from saccade.tests.fakes.weights import write_random_weights
 
 
 def record(target="mug", success=True, azimuth=0.1, steps=10, declared=True, declared_true=True, **more):
@@ -266,7 +266,7 @@ def test_the_commit_is_dirty_by_the_source_alone(tmp_path, monkeypatch):
     git("init")
     git("add", ".")
     git("commit", "-m", "first")
-    monkeypatch.setattr(provenance, "REPOSITORY", tmp_path)
+    monkeypatch.setattr(provenance, "PACKAGE", tmp_path)
     (tmp_path / "results" / "file").write_text("b")
     assert re.fullmatch("[0-9a-f]{40}", provenance.commit())
     (tmp_path / "shared" / "file").write_text("b")

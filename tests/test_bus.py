@@ -10,9 +10,9 @@ from contextlib import closing, suppress
 
 import pytest
 
-from shared.bus import LocalBus, ZenohBus, free_endpoint
-from shared.errors import SaccadeError
-from shared.topics import ACTION, FRAME, PERCEPT, RESULT
+from saccade.shared.bus.topics import ACTION, FRAME, PERCEPT, RESULT
+from saccade.shared.bus.transport import LocalBus, ZenohBus, free_endpoint
+from saccade.shared.errors import SaccadeError
 
 WAIT_S = 20  # for what must come; nothing is asserted about how long it takes
 
@@ -136,8 +136,8 @@ def test_closing_twice_and_publishing_afterwards_is_harmless(pair):
 
 LOOKS_ON = """
 import sys, time
-from shared.bus import ZenohBus
-from shared.topics import FRAME
+from saccade.shared.bus.transport import ZenohBus
+from saccade.shared.bus.topics import FRAME
 bus = ZenohBus(sys.argv[1], world="test", onlooker=True)
 bus.subscribe((FRAME,), lambda *item: None)
 bus.join("there", "it", lambda members: None)

@@ -7,11 +7,11 @@ import io
 import pytest
 from rich.console import Console
 
-from benchmarks.bus.__main__ import NOT_INSTALLED, YARDSTICKS, measure, table
-from benchmarks.bus.contenders import CONTENDERS, OURS
-from benchmarks.bus.measure import KINDS, Plan
-from benchmarks.bus.pyzmq import PyZmq
-from shared.errors import SaccadeError
+from saccade.benchmarks.bus.__main__ import NOT_INSTALLED, YARDSTICKS, measure, table
+from saccade.benchmarks.bus.contenders import CONTENDERS, OURS
+from saccade.benchmarks.bus.measure import KINDS, Plan
+from saccade.benchmarks.bus.pyzmq import PyZmq
+from saccade.shared.errors import SaccadeError
 
 PLAN = Plan(rounds=1, messages=4, warmup=1, period_s=0.001)
 

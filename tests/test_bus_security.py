@@ -13,17 +13,16 @@ from typing import IO
 
 import pytest
 
-from deploy.logs.check import missing
-from deploy.zenoh.access import access_control, declared, users
-from deploy.zenoh.make import make
-from shared.config import REPOSITORY
+from saccade.app.log.check import missing
+from saccade.deploy.zenoh.access import access_control, declared, users
+from saccade.deploy.zenoh.make import make
 
 ADDRESS, OTHER = "10.199.7.1", "10.199.7.2"
 ENDPOINT = f"tls/{ADDRESS}:7447"
 SAY = """
 import sys, time
-from shared.bus import ZenohBus
-from shared.topics import TOPICS
+from saccade.shared.bus.transport import ZenohBus
+from saccade.shared.bus.topics import TOPICS
 bus = ZenohBus(sys.argv[1], world="table", timeout_s=3)
 time.sleep(0.5)
 bus.publish(TOPICS[sys.argv[2]], None, sys.argv[3].encode())
@@ -32,8 +31,8 @@ bus.close()
 """
 HEAR = """
 import sys, time
-from shared.bus import ZenohBus
-from shared.topics import TOPICS
+from saccade.shared.bus.transport import ZenohBus
+from saccade.shared.bus.topics import TOPICS
 bus = ZenohBus(sys.argv[1], world="table", timeout_s=3)
 bus.subscribe([TOPICS[sys.argv[2]]], lambda topic, part, payload: print("heard", payload.decode(), flush=True))
 print("listens", flush=True)
@@ -41,7 +40,7 @@ time.sleep(60)
 """
 ROUTER = """
 import sys, time
-from shared.bus import ZenohBus
+from saccade.shared.bus.transport import ZenohBus
 bus = ZenohBus(sys.argv[1], world="table", listen=True)
 print("listens", flush=True)
 time.sleep(300)
@@ -53,7 +52,7 @@ def ip(*arguments: str, check: bool = True) -> bool:
 
 
 class Hosts:
-    """Two of them with a cable, and the files of `deploy.zenoh.make`."""
+    """Two of them with a cable, and the files of `saccade.deploy.zenoh.make`."""
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.names = folder, (f"saccade-a-{os.getpid()}", f"saccade-b-{os.getpid()}")
@@ -63,7 +62,7 @@ class Hosts:
               **environment: str) -> subprocess.Popen:
         """A process on host 0 or 1 as that user: a name, another configuration, or nobody."""
         file = self.folder / f"{user}.json5" if isinstance(user, str) else user
-        environment = {**os.environ, "PYTHONPATH": str(REPOSITORY), **environment}
+        environment = {**os.environ, **environment}
         if file:
             environment["ZENOH_CONFIG"] = str(file)
         process = subprocess.Popen(["ip", "netns", "exec", self.names[host], sys.executable, *command], text=True,
@@ -138,9 +137,9 @@ def test_an_agent_runs_across_two_hosts(hosts, tmp_path):
     for host, names in enumerate((here, there)):
         for name in names:
             with (tmp_path / f"{name}.log").open("w") as log:
-                hosts.start(host, name, "-m", "deploy.container", name, out=log,
+                hosts.start(host, name, "-m", "saccade.deploy.container", name, out=log,
                             SACCADE_HEARTBEATS=str(tmp_path / name), **runs)
-    director = hosts.start(0, "director", "-m", "deploy.director", f"--endpoint={ENDPOINT}", "--seed=3",
+    director = hosts.start(0, "director", "-m", "saccade.deploy.director", f"--endpoint={ENDPOINT}", "--seed=3",
                            SACCADE_HEARTBEATS=str(tmp_path / "director"), **runs)
     said = director.communicate(timeout=240)[0]
     assert "reached the goal in" in said, said + "".join(path.read_text() for path in tmp_path.glob("*.log"))
@@ -161,7 +160,7 @@ def test_access_follows_the_declarations():
 def test_a_configuration_that_is_none_is_told(tmp_path):
     (tmp_path / "z.json5").write_text("{")
     done = subprocess.run([sys.executable, "-c", SAY, "tcp/127.0.0.1:1", "action", "x"], text=True, capture_output=True,
-                          env={**os.environ, "ZENOH_CONFIG": str(tmp_path / "z.json5"), "PYTHONPATH": str(REPOSITORY)})
+                          env={**os.environ, "ZENOH_CONFIG": str(tmp_path / "z.json5")})
     assert f"ZENOH_CONFIG={tmp_path / 'z.json5'}: no configuration of Zenoh's" in done.stderr
 
 

@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from deploy.run import resolve
-from services.camera.core import SERVICE, Camera, build
-from services.camera.poses import read_poses
-from services.camera.sources import SourceImage
-from services.camera.virtual_camera import VirtualCamera
-from shared.config import Config
-from shared.geometry import INTRINSICS_PX, project
-from shared.messages import Action, Frame
-from shared.task import start_pose
-from shared.wire import decode, encode
-from tests.fakes.camera import HERE, THERE, centroid, complaint, dots, folder_of, line, tum, written
+from saccade.app.run.run import resolve
+from saccade.services.camera.core import SERVICE, Camera, build
+from saccade.services.camera.poses import read_poses
+from saccade.services.camera.sources import SourceImage
+from saccade.services.camera.virtual_camera import VirtualCamera
+from saccade.shared.bus.messages import Action, Frame
+from saccade.shared.bus.wire import decode, encode
+from saccade.shared.config import Config
+from saccade.shared.world.geometry import INTRINSICS_PX, project
+from saccade.shared.world.task import start_pose
+from saccade.tests.fakes.camera import HERE, THERE, centroid, complaint, dots, folder_of, line, tum, written
 
 
 def camera_of(source, **values):

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from services.camera.poses import read_poses
-from services.camera.sources import SourceImage
-from shared.geometry import INTRINSICS_PX, project, rotation_angle
-from tests.fakes.camera import HERE, THERE, complaint, line, tum, written
+from saccade.services.camera.poses import read_poses
+from saccade.services.camera.sources import SourceImage
+from saccade.shared.world.geometry import INTRINSICS_PX, project, rotation_angle
+from saccade.tests.fakes.camera import HERE, THERE, complaint, line, tum, written
 
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 

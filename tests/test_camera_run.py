@@ -17,23 +17,23 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
-from deploy.display import Display, line, panel
-from deploy.logs.check import missing
-from deploy.picture import read_story
-from deploy.replay import prepare, replay_here, replay_on_bus
-from deploy.run import in_world, run
-from services.replayer.core import Keys, Pace
-from services.viewer.server import free_port
-from shared.config import REPOSITORY, Config, load
-from shared.errors import SaccadeError
-from shared.messages import Belief, Frame, Plan, Status
-from shared.reading import RunReader
-from shared.topics import BELIEF, FRAME, GOAL, PERCEPT, PLAN, RESULT, STATUS, TRUTH
-from tests.fakes.camera import LENS_PX, film, folder_of, written
-from tests.fakes.camera import line as pose_line
-from tests.fakes.logs import so_far
-from tests.front_door import call
-from tests.samples import sample
+from saccade.app.log.check import missing
+from saccade.app.look.picture import read_story
+from saccade.app.replay.replay import prepare, replay_here, replay_on_bus
+from saccade.app.run.display import Display, line, panel
+from saccade.app.run.run import in_world, run
+from saccade.services.replayer.core import Keys, Pace
+from saccade.services.viewer.server import free_port
+from saccade.shared.bus.messages import Belief, Frame, Plan, Status
+from saccade.shared.bus.topics import BELIEF, FRAME, GOAL, PERCEPT, PLAN, RESULT, STATUS, TRUTH
+from saccade.shared.config import Config, load
+from saccade.shared.errors import SaccadeError
+from saccade.shared.log.reading import RunReader
+from saccade.tests.fakes.camera import LENS_PX, film, folder_of, written
+from saccade.tests.fakes.camera import line as pose_line
+from saccade.tests.fakes.logs import so_far
+from saccade.tests.front_door import call
+from saccade.tests.samples import sample
 
 VIEWS = 32
 WAIT_S = 120  # for what must come; nothing is asserted about how long it takes
@@ -125,9 +125,9 @@ def interrupted(filmed, out, *options, **streams):
     """The command on a film without end; Ctrl-C once it has been round."""
     video, poses, _ = filmed
     process = subprocess.Popen(
-        [sys.executable, "-m", "deploy.cli", "run", "--world", "camera", "--source", video, "--poses", poses,
+        [sys.executable, "-m", "saccade", "run", "--world", "camera", "--source", video, "--poses", poses,
          "--intrinsics", ",".join(map(str, LENS_PX)), "--loop", "--plain", "--out", out, *options],
-        env={**os.environ, "PYTHONPATH": str(REPOSITORY)}, text=True, **streams)
+        text=True, **streams)
     try:
         end = time.monotonic() + WAIT_S
         while time.monotonic() < end and not any(

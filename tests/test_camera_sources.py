@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from services.camera import sources
-from services.camera.sources import Webcam, open_source
-from tests.fakes.camera import complaint, folder_of
+from saccade.services.camera import sources
+from saccade.services.camera.sources import Webcam, open_source
+from saccade.tests.fakes.camera import complaint, folder_of
 
 cv2 = sources._cv2()  # as the source loads it: quiet
 

@@ -17,27 +17,26 @@ import pytest
 import typer
 from rich.console import Console
 
-import deploy.cli as cli
-from deploy.display import Progress, line, panel
-from deploy.doctor import Check, Finding, examine
-from deploy.logs.check import missing
-from deploy.run import run
-from services.simulator.scenes import PAPER_SCENES
-from shared.config import REPOSITORY, Config, load
-from shared.errors import SaccadeError
-from shared.messages import Belief, Plan, Status, Truth
-from shared.reading import RunReader
-from shared.topics import BELIEF, PLAN, STATUS, TOPICS, TRUTH
-from tests.fakes.weights import write_random_weights
-from tests.front_door import call
-from tests.samples import sample
+import saccade.app.cli.main as cli
+from saccade.app.doctor import Check, Finding, examine
+from saccade.app.log.check import missing
+from saccade.app.run.display import Progress, line, panel
+from saccade.app.run.run import run
+from saccade.services.simulator.scenes import PAPER_SCENES
+from saccade.shared.bus.messages import Belief, Plan, Status, Truth
+from saccade.shared.bus.topics import BELIEF, PLAN, STATUS, TOPICS, TRUTH
+from saccade.shared.config import PACKAGE, WEIGHTS, Config, load
+from saccade.shared.errors import SaccadeError
+from saccade.shared.log.reading import RunReader
+from saccade.tests.fakes.weights import write_random_weights
+from saccade.tests.front_door import call
+from saccade.tests.samples import sample
 
 NAMES = ("coffee_can", "soup_can")
 
 
 def started(*arguments, **more) -> subprocess.Popen:
-    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
-    return subprocess.Popen([sys.executable, "-m", "deploy.cli", *map(str, arguments)], env=environment, text=True,
+    return subprocess.Popen([sys.executable, "-m", "saccade", *map(str, arguments)], text=True,
                             stdout=subprocess.PIPE, stderr=subprocess.PIPE, **more)
 
 
@@ -96,8 +95,9 @@ def test_every_command_explains_itself(monkeypatch, capsys, words):
 
 def test_help_loads_nothing_heavy():
     """So that it is there at once."""
-    script = "import sys, deploy.cli; print([m for m in ('torch', 'mujoco', 'zenoh', 'numpy') if m in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", script], cwd=REPOSITORY, capture_output=True, text=True, check=True)
+    script = ("import sys, saccade.app.cli.main; "
+              "print([m for m in ('torch', 'mujoco', 'zenoh', 'numpy') if m in sys.modules])")
+    done = subprocess.run([sys.executable, "-c", script], cwd=PACKAGE, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 
 
@@ -165,7 +165,7 @@ def test_interrupt_is_one_line_and_code_130(monkeypatch, capsys):
 
     before = signal.getsignal(signal.SIGINT)
     try:
-        monkeypatch.setattr("deploy.doctor.examine", interrupt)
+        monkeypatch.setattr("saccade.app.doctor.examine", interrupt)
         assert call(monkeypatch, capsys, "doctor")[::2] == (130, "saccade: interrupted: half is done\n")
     finally:
         signal.signal(signal.SIGINT, before)
@@ -245,7 +245,7 @@ def test_oracle_run_leaves_a_whole_log_configuration_and_picture(monkeypatch, ca
 
 def test_bus_and_one_process_log_the_same_bytes(tmp_path):
     """The shipped agent as processes on Zenoh and within this process; but for the statuses, which time makes."""
-    episode = small(REPOSITORY / "weights" / "pantry", **{
+    episode = small(WEIGHTS / "pantry", **{
         "simulator.max_steps": 12, "planner.candidates": 5000, "scene.n_objects": 2})
     logs = []
     for kind in ("zenoh", "local"):

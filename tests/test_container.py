@@ -12,12 +12,12 @@ import time
 
 import pytest
 
-from deploy.container import LATEST, OVER, Container, mine, worlds_of
-from deploy.director import prepare
-from shared.config import REPOSITORY, Config
-from shared.errors import SaccadeError
+from saccade.deploy.container import LATEST, OVER, Container, mine, worlds_of
+from saccade.deploy.director import prepare
+from saccade.shared.config import PACKAGE, Config
+from saccade.shared.errors import SaccadeError
 
-HEALTHY = REPOSITORY / "deploy" / "healthy.sh"
+HEALTHY = PACKAGE / "deploy" / "healthy.sh"
 
 
 def names(folders) -> list[str]:
@@ -60,14 +60,14 @@ def test_a_folder_that_cannot_be_written_is_told(tmp_path):
 
 
 def test_where_no_run_goes_on_it_ends_and_says_so(tmp_path):
-    done = subprocess.run([sys.executable, "-m", "deploy.container", "belief"], capture_output=True, text=True,
-                          cwd=REPOSITORY, env={**os.environ, "SACCADE_RUNS": str(tmp_path)})
+    done = subprocess.run([sys.executable, "-m", "saccade.deploy.container", "belief"], capture_output=True, text=True,
+                          cwd=PACKAGE, env={**os.environ, "SACCADE_RUNS": str(tmp_path)})
     assert (done.returncode, done.stderr) == (0, f"saccade: belief: no run goes on in {tmp_path}\n")
 
 
 def test_a_service_that_cannot_run_says_so_once_and_stays_down_until_the_run_is_over(tmp_path):
     folder, = prepare(Config(bus={"endpoint": "tcp/127.0.0.1:9"}), 1, tmp_path)
-    process = subprocess.Popen([sys.executable, "-m", "deploy.container", "evaluator"], text=True, cwd=REPOSITORY,
+    process = subprocess.Popen([sys.executable, "-m", "saccade.deploy.container", "evaluator"], text=True, cwd=PACKAGE,
                                stderr=subprocess.PIPE, env={**os.environ, "SACCADE_RUNS": str(tmp_path),
                                                             "SACCADE_HEARTBEATS": str(tmp_path / "beats")})
     line = process.stderr.readline()
@@ -84,8 +84,8 @@ def test_who_is_stopped_before_it_has_begun_is_not_waited_for_long(tmp_path, mon
     prepare(Config(), 1, tmp_path)
     monkeypatch.setenv("SACCADE_RUNS", str(tmp_path))
     monkeypatch.setenv("SACCADE_HEARTBEATS", str(tmp_path / "beats"))
-    monkeypatch.setattr("deploy.container.STOP_S", math.inf)
-    monkeypatch.setattr("deploy.container.STOP_UNBEGUN_S", 0.1)
+    monkeypatch.setattr("saccade.deploy.container.STOP_S", math.inf)
+    monkeypatch.setattr("saccade.deploy.container.STOP_UNBEGUN_S", 0.1)
     deaf = subprocess.Popen(["sh", "-c", "trap '' TERM; echo; while :; do sleep 0.1; done"], stdout=subprocess.PIPE)
     assert deaf.stdout.readline() == b"\n"
     container = Container("belief")

@@ -9,12 +9,12 @@ import kubernetes_validate
 import pytest
 import yaml
 
-from deploy.registry import agent_processes
-from shared.config import REPOSITORY
+from saccade.app.run.registry import agent_processes
+from saccade.shared.config import PACKAGE
 
 PROCESSES = {process.name: process.module for process in agent_processes("sceneccn", view=True)}
 BESIDE = {"director"}  # in the launcher's place
-KUBERNETES = REPOSITORY / "deploy" / "kubernetes"
+KUBERNETES = PACKAGE / "deploy" / "kubernetes"
 VERSION = "1.31"
 UNITS = {"m": 2 ** 20, "g": 2 ** 30, "Mi": 2 ** 20, "Gi": 2 ** 30}
 
@@ -26,7 +26,7 @@ def bytes_of(size: str) -> int:
 
 @pytest.fixture(scope="module")
 def compose() -> dict:
-    return yaml.safe_load((REPOSITORY / "compose.yaml").read_text())["services"]
+    return yaml.safe_load((PACKAGE / "compose.yaml").read_text())["services"]
 
 
 @pytest.fixture(scope="module")
@@ -55,10 +55,10 @@ def test_all_start_the_same_processes(compose, kubernetes):
 
 
 def test_each_has_an_image_whose_container_starts_its_module(kubernetes):
-    dockerfile = (REPOSITORY / "deploy" / "Dockerfile").read_text()
+    dockerfile = (PACKAGE / "deploy" / "Dockerfile").read_text()
     stages = {stage.split()[2]: stage for stage in dockerfile.split("\nFROM ")[1:]}
     for name, module in PROCESSES.items():
-        assert module == f"services.{name}"  # as deploy/container.py starts it
+        assert module == f"saccade.services.{name}"  # as deploy/container.py starts it
         assert f'CMD ["{name}"]' in stages[name]
         assert f"COPY services/{name} services/{name}" in stages[name]
         assert containers(kubernetes)[name]["args"] == [name]

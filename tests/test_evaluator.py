@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from services.evaluator.core import Evaluator
-from shared.geometry import look_at
-from shared.messages import Truth
-from shared.wire import encode
+from saccade.services.evaluator.core import Evaluator
+from saccade.shared.bus.messages import Truth
+from saccade.shared.bus.wire import encode
+from saccade.shared.world.geometry import look_at
 
 TARGET = np.array([0.1, 0.0, 0.05])
 GOAL = look_at(TARGET + np.array([0.3, 0.0, 0.0]), TARGET)

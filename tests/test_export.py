@@ -14,17 +14,17 @@ from mcap_protobuf.decoder import DecoderFactory
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from deploy.logs import scene
-from deploy.logs.export import export_foxglove
-from deploy.logs.fields import kinds
-from deploy.picture import COLOURS
-from shared.geometry import project
-from shared.messages import ArraySpec
-from shared.migrations import FORMAT
-from shared.reading import RunReader
-from shared.topics import BELIEF, FRAME, GOAL, PERCEPT, PLAN, STATUS, TOPICS
-from tests.fakes.logs import CENTERS, GOAL_CAMERA, INTRINSICS, SIZE, START_NS, camera_at, of, story, write
-from tests.samples import sample
+from saccade.app.log import foxglove as scene
+from saccade.app.log.export import export_foxglove
+from saccade.app.log.fields import kinds
+from saccade.app.palette import COLOURS
+from saccade.shared.bus.messages import ArraySpec
+from saccade.shared.bus.topics import BELIEF, FRAME, GOAL, PERCEPT, PLAN, STATUS, TOPICS
+from saccade.shared.log.migrations import FORMAT
+from saccade.shared.log.reading import RunReader
+from saccade.shared.world.geometry import project
+from saccade.tests.fakes.logs import CENTERS, GOAL_CAMERA, INTRINSICS, SIZE, START_NS, camera_at, of, story, write
+from saccade.tests.samples import sample
 
 
 @pytest.fixture(scope="module")

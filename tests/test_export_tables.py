@@ -14,16 +14,16 @@ import pytest
 from mcap.reader import make_reader
 from rich.console import Console
 
-from deploy.logs import tables
-from deploy.logs.export import export_foxglove, export_tables
-from deploy.logs.fields import kinds
-from shared.errors import SaccadeError
-from shared.messages import ArraySpec, field_types
-from shared.recording import RunLog
-from shared.topics import FRAME, PLAN, TOPICS
-from shared.wire import encode
-from tests.fakes.logs import CENTERS, SIZE, START_NS, of, story, write
-from tests.samples import sample
+from saccade.app.log import tables
+from saccade.app.log.export import export_foxglove, export_tables
+from saccade.app.log.fields import kinds
+from saccade.shared.bus.messages import ArraySpec, field_types
+from saccade.shared.bus.topics import FRAME, PLAN, TOPICS
+from saccade.shared.bus.wire import encode
+from saccade.shared.errors import SaccadeError
+from saccade.shared.log.recording import RunLog
+from saccade.tests.fakes.logs import CENTERS, SIZE, START_NS, of, story, write
+from saccade.tests.samples import sample
 
 RNG = np.random.default_rng(0)
 
@@ -169,7 +169,7 @@ def test_a_missing_package_is_named_with_the_command_that_installs_it(run, tmp_p
     for name in [n for n in sys.modules if n == package or n.startswith(f"{package}.")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, package, None)
-    monkeypatch.delitem(sys.modules, f"deploy.logs.{module}", raising=False)
+    monkeypatch.delitem(sys.modules, f"saccade.app.log.{module}", raising=False)
     with pytest.raises(SaccadeError, match=rf"package {package}.*pip install 'saccade\[export\]'"):
         both(run[0], tmp_path)[kind]()
     assert not list(tmp_path.iterdir())

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.fakes.logs import story, write
-from tests.fixtures.make import GOLDEN
-from tests.front_door import call
+from saccade.tests.fakes.logs import story, write
+from saccade.tests.fixtures.make import GOLDEN
+from saccade.tests.front_door import call
 
 STEPS, RATE_HZ = 4, 4
 LASTS = 2 * RATE_HZ  # frames for which the end stays

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from services.planner.free_energy import (
+from saccade.services.planner.free_energy import (
     ACROSS_STD_M,
     ALONG_SHARE,
     FARTHEST_M,
@@ -15,8 +15,9 @@ from services.planner.free_energy import (
     pose_cost,
     scale_cost,
 )
-from services.planner.goal import Preference, aim
-from shared.geometry import (
+from saccade.services.planner.goal import Preference, aim
+from saccade.shared.bus.messages import Belief
+from saccade.shared.world.geometry import (
     GRID_AZIMUTHS,
     GRID_ELEVATIONS,
     INTRINSICS_PX,
@@ -25,7 +26,6 @@ from shared.geometry import (
     project,
     viewing_grid,
 )
-from shared.messages import Belief
 
 
 def belief(mean=(0.1, -0.05, 0.08), deviation=0.02, posterior=None, presence=0.9, seed=0) -> Belief:

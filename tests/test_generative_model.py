@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from services.perception.networks import CELLS, MASK_PX, Extraction, Identity, tally
-from shared import drawing, latent
-from shared.config import REPOSITORY
-from shared.generative_model import (
+from saccade.services.perception.networks import CELLS, MASK_PX, Extraction, Identity, tally
+from saccade.shared.config import WEIGHTS
+from saccade.shared.model import drawing, latent
+from saccade.shared.model.generative_model import (
     CCN,
     LATENT,
     Encoder,
@@ -18,7 +18,7 @@ from shared.generative_model import (
     log_density,
     transition_of,
 )
-from shared.weights import Weights
+from saccade.shared.model.weights import Weights
 
 
 @pytest.mark.parametrize("count", [1, 2, 5])
@@ -61,7 +61,7 @@ def test_gaussian_formulas_equal_those_of_torch():
 
 @pytest.mark.parametrize("folder", ["pantry", "ycb", "ycb-paper"])
 def test_what_belief_does_in_numpy_is_what_was_trained_in_torch(folder):
-    weights = Weights(REPOSITORY / "weights" / folder)
+    weights = Weights(WEIGHTS / folder)
     name = weights.names[0]
     network = weights.fill(transition_of(weights.architecture), name, latent.PREFIX)
     rng = np.random.default_rng(0)
@@ -80,7 +80,7 @@ def test_what_belief_does_in_numpy_is_what_was_trained_in_torch(folder):
 
 @pytest.mark.parametrize("folder", ["pantry", "ycb", "ycb-paper"])
 def test_what_the_viewer_draws_in_numpy_is_what_was_trained_in_torch(folder):
-    weights = Weights(REPOSITORY / "weights" / folder)
+    weights = Weights(WEIGHTS / folder)
     start = np.random.default_rng(1).normal(size=LATENT).astype(np.float32)
     for name in weights.names:
         network = weights.fill(decoder_of(weights.architecture), name, drawing.PREFIX)

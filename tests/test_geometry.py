@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from shared.geometry import (
+from saccade.shared.world.geometry import (
     INTRINSICS_PX,
     direction,
     euler_xyz,
@@ -20,7 +20,7 @@ from shared.geometry import (
     unit,
     wrap,
 )
-from shared.windows import Window
+from saccade.shared.world.windows import Window
 
 
 @pytest.fixture

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from services.planner.motion import step_towards
-from services.simulator.gym_env import ID
-from services.simulator.scenes import generate_split, save_scenes
-from shared.errors import SaccadeError
+from saccade.services.planner.motion import step_towards
+from saccade.services.simulator.gym_env import ID
+from saccade.services.simulator.scenes import generate_split, save_scenes
+from saccade.shared.errors import SaccadeError
 
 OPTIONS = {"names": ("soup_can", "rice_box"), "n_objects": 2}
 

@@ -13,19 +13,19 @@ from collections import defaultdict
 
 import pytest
 
-from deploy.launch import PROCESSES, launch, launched
-from deploy.logs.check import missing
-from deploy.supervisor import Process
-from shared.bus import ZenohBus, free_endpoint
-from shared.config import load
-from shared.errors import SaccadeError
-from shared.local import run_local
-from shared.messages import Status
-from shared.reading import RunReader
-from shared.topics import FRAME, RESULT, STATUS
-from tests.fakes.launch import FAKES, PARTS, configuration, processes_of
-from tests.fakes.logs import so_far
-from tests.fakes.services import pairs
+from saccade.app.log.check import missing
+from saccade.app.run.launch import PROCESSES, launch, launched
+from saccade.app.run.supervisor import Process
+from saccade.shared.bus.messages import Status
+from saccade.shared.bus.topics import FRAME, RESULT, STATUS
+from saccade.shared.bus.transport import ZenohBus, free_endpoint
+from saccade.shared.config import load
+from saccade.shared.errors import SaccadeError
+from saccade.shared.log.reading import RunReader
+from saccade.shared.loop.local import run_local
+from saccade.tests.fakes.launch import FAKES, PARTS, configuration, processes_of
+from saccade.tests.fakes.logs import so_far
+from saccade.tests.fakes.services import pairs
 
 WAIT_S = 60
 
@@ -92,8 +92,8 @@ def test_a_service_that_ends_is_named_with_its_reason(tmp_path, wish, message):
     assert not missing(tmp_path / "run" / "run.mcap").cut
 
 
-@pytest.mark.parametrize(("module", "reason"), [("tests.fakes.nothing", "it has died 6 times"),
-                                                ("services.viewer", "cannot be opened")])
+@pytest.mark.parametrize(("module", "reason"), [("saccade.tests.fakes.nothing", "it has died 6 times"),
+                                                ("saccade.services.viewer", "cannot be opened")])
 def test_a_run_goes_on_without_one_who_only_looks_on(tmp_path, module, reason):
     """Who dies again and again, or cannot have its port, says why; nothing else happens."""
     said, looking = [], Process("viewer", module, onlooker=True)
@@ -106,7 +106,7 @@ def test_a_run_goes_on_without_one_who_only_looks_on(tmp_path, module, reason):
 
 
 def test_one_who_looks_on_stays_when_the_others_are_stopped(tmp_path):
-    looking = Process("replayer", "tests.fakes.onlooker", onlooker=True)
+    looking = Process("replayer", "saccade.tests.fakes.onlooker", onlooker=True)
     with launched(configuration(1, 3), tmp_path / "run", None, (*FAKES, looking)) as ended:
         assert len(ended.results) == 1
         assert ended.runs("replayer")
@@ -139,7 +139,7 @@ def test_a_log_is_never_written_over(tmp_path, run):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL], ids=lambda s: s.name)
 def test_an_interrupted_launcher_leaves_no_process_and_a_readable_log(tmp_path, number):
     run_dir = tmp_path / "run"
-    launcher = subprocess.Popen([sys.executable, "-m", "tests.fakes.launch", str(run_dir), "1", "1000000"],
+    launcher = subprocess.Popen([sys.executable, "-m", "saccade.tests.fakes.launch", str(run_dir), "1", "1000000"],
                                 stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
     try:
         log = run_dir / "run.mcap"

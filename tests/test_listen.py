@@ -14,20 +14,20 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from deploy.echo import block, of_array, show
-from deploy.hz import Rates, follow
-from deploy.keys import Keys
-from deploy.listen import Heard, Live, Logged, Wanted, live, newest_run, on_bus
-from deploy.topics import survey
-from shared.bus import ZenohBus, free_endpoint
-from shared.config import Config
-from shared.errors import SaccadeError
-from shared.outbox import Outbox
-from shared.topics import ACTION, FRAME, GOAL, GOAL_PERCEPT, PERCEPT, TOPICS, TRUTH
-from shared.wire import encode
-from tests.fakes.logs import story, write
-from tests.front_door import call, rows
-from tests.samples import sample
+from saccade.app.log.traffic import Keys
+from saccade.app.look.echo import block, of_array, show
+from saccade.app.look.hz import Rates, follow
+from saccade.app.look.listen import Heard, Live, Logged, Wanted, live, newest_run, on_bus
+from saccade.app.look.topics import survey
+from saccade.shared.bus.outbox import Outbox
+from saccade.shared.bus.topics import ACTION, FRAME, GOAL, GOAL_PERCEPT, PERCEPT, TOPICS, TRUTH
+from saccade.shared.bus.transport import ZenohBus, free_endpoint
+from saccade.shared.bus.wire import encode
+from saccade.shared.config import Config
+from saccade.shared.errors import SaccadeError
+from saccade.tests.fakes.logs import story, write
+from saccade.tests.front_door import call, rows
+from saccade.tests.samples import sample
 
 WAIT_S = 30
 

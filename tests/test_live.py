@@ -11,31 +11,32 @@ from contextlib import closing, suppress
 
 import pytest
 
-from deploy.launch import ROUTER, launch
-from deploy.logs.check import missing
-from deploy.supervisor import Process
-from shared.bus import LocalBus
-from shared.local import run_local
-from shared.loop import serve
-from shared.messages import Status
-from shared.outbox import Outbox
-from shared.process import Inbox
-from shared.reading import RunReader
-from shared.sequences import Sequences
-from shared.service import Service
-from shared.stepper import Stepper
-from shared.ticker import Ticker
-from shared.topics import ACTION, FRAME, GOAL, PERCEPT, PLAN, STATUS
-from shared.wire import MessageError, decode, encode
-from tests.fakes.launch import PARTS, configuration, processes_of
-from tests.fakes.services import BELIEVER, PERCEPTION, PLANNER, FakeBelief, FakePerception, FakePlanner
-from tests.fakes.timed import TIMED, FakeCamera
-from tests.samples import sample
+from saccade.app.log.check import missing
+from saccade.app.run.launch import ROUTER, launch
+from saccade.app.run.supervisor import Process
+from saccade.shared.bus.messages import Status
+from saccade.shared.bus.outbox import Outbox
+from saccade.shared.bus.sequences import Sequences
+from saccade.shared.bus.topics import ACTION, FRAME, GOAL, PERCEPT, PLAN, STATUS
+from saccade.shared.bus.transport import LocalBus
+from saccade.shared.bus.wire import MessageError, decode, encode
+from saccade.shared.log.reading import RunReader
+from saccade.shared.loop.local import run_local
+from saccade.shared.loop.main import serve
+from saccade.shared.loop.process import Inbox
+from saccade.shared.loop.service import Service
+from saccade.shared.loop.stepper import Stepper
+from saccade.shared.loop.ticker import Ticker
+from saccade.tests.fakes.launch import PARTS, configuration, processes_of
+from saccade.tests.fakes.services import BELIEVER, PERCEPTION, PLANNER, FakeBelief, FakePerception, FakePlanner
+from saccade.tests.fakes.timed import TIMED, FakeCamera
+from saccade.tests.samples import sample
 
 WAIT_S = 30  # for what must come; nothing is asserted about how long it takes
 AGENTS = ("perception", "belief", "planner")
-PROCESSES = (ROUTER, Process("timed", "tests.fakes.timed"), *(Process(n, f"tests.fakes.{n}") for n in AGENTS),
-             Process("recorder", "services.recorder"))
+PROCESSES = (ROUTER, Process("timed", "saccade.tests.fakes.timed"), 
+             *(Process(n, f"saccade.tests.fakes.{n}") for n in AGENTS),
+             Process("recorder", "saccade.services.recorder"))
 
 
 class Clock:

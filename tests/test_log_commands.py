@@ -6,16 +6,16 @@ from pathlib import Path
 
 import pytest
 
-from deploy.logs.check import abbreviated, missing
-from deploy.logs.cut import CUT, Range, cut, range_of
-from shared.errors import SaccadeError
-from shared.migrations import FORMAT
-from shared.reading import RunReader
-from shared.recording import RunLog
-from shared.topics import ACTION, FRAME, GOAL, PERCEPT, RESULT, STATUS, TRUTH
-from shared.wire import encode
-from tests.front_door import call, rows
-from tests.samples import sample
+from saccade.app.log.check import abbreviated, missing
+from saccade.app.log.cut import CUT, Range, cut, range_of
+from saccade.shared.bus.topics import ACTION, FRAME, GOAL, PERCEPT, RESULT, STATUS, TRUTH
+from saccade.shared.bus.wire import encode
+from saccade.shared.errors import SaccadeError
+from saccade.shared.log.migrations import FORMAT
+from saccade.shared.log.reading import RunReader
+from saccade.shared.log.recording import RunLog
+from saccade.tests.front_door import call, rows
+from saccade.tests.samples import sample
 
 STEPS = 6
 GOLDEN = Path(__file__).with_name("fixtures") / "golden.mcap"
@@ -132,7 +132,7 @@ def test_recover_on_the_command_line(monkeypatch, capsys, run, tmp_path):
     code, out, _ = call(monkeypatch, capsys, "log", "recover", tmp_path / "cut.mcap", "--out", tmp_path / "b.mcap")
     assert (code, "nothing is missing" in out) == (0, True)
     assert missing(tmp_path / "b.mcap").complete
-    monkeypatch.setattr("shared.recording.FLUSH_S", 0.0)
+    monkeypatch.setattr("saccade.shared.log.recording.FLUSH_S", 0.0)
     whole = write(tmp_path / "c.mcap", story(1)).read_bytes()
     (tmp_path / "cut.mcap").write_bytes(whole[:len(whole) // 2])
     code, out, _ = call(monkeypatch, capsys, "log", "recover", tmp_path / "cut.mcap", "--out", tmp_path / "d.mcap")

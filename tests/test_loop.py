@@ -12,18 +12,30 @@ import msgpack
 import numpy as np
 import pytest
 
-from shared.bus import LocalBus, ZenohBus, free_endpoint
-from shared.config import Config
-from shared.errors import SaccadeError
-from shared.local import run_local
-from shared.loop import main, serve
-from shared.messages import Status
-from shared.process import Inbox
-from shared.service import Output, Service
-from shared.topics import ACTION, BELIEF, FRAME, GOAL_PERCEPT, PERCEPT, PLAN, RESULT, STATUS, TOPICS, TRUTH
-from shared.wire import MAX_BYTES, decode, encode
-from tests.fakes.services import SERVICES, FakePlanner, pairs
-from tests.samples import array_fields, sample
+from saccade.shared.bus.messages import Status
+from saccade.shared.bus.topics import (
+    ACTION,
+    BELIEF,
+    FRAME,
+    GOAL_PERCEPT,
+    PERCEPT,
+    PLAN,
+    RESULT,
+    STATUS,
+    TOPICS,
+    TRUTH,
+    Output,
+)
+from saccade.shared.bus.transport import LocalBus, ZenohBus, free_endpoint
+from saccade.shared.bus.wire import MAX_BYTES, decode, encode
+from saccade.shared.config import Config
+from saccade.shared.errors import SaccadeError
+from saccade.shared.loop.local import run_local
+from saccade.shared.loop.main import main, serve
+from saccade.shared.loop.process import Inbox
+from saccade.shared.loop.service import Service
+from saccade.tests.fakes.services import SERVICES, FakePlanner, pairs
+from saccade.tests.samples import array_fields, sample
 
 PARTS = ("mug", "can")
 CONFIG = Config().with_values({"scene.names": list(PARTS), "scene.count": 2, "simulator.max_steps": 6, "seed": 5})
@@ -200,7 +212,7 @@ def test_the_source_begins_when_everyone_is_ready():
 
 
 def test_a_service_says_what_it_waits_for_and_goes_on_when_it_comes(monkeypatch):
-    monkeypatch.setattr("shared.loop.IDLE_S", 0.05)
+    monkeypatch.setattr("saccade.shared.loop.main.IDLE_S", 0.05)
     with closing(Running("local", names=("planner",))) as running:
         running.until_status("planner", lambda s: s.state == "ready")
         running.listener.publish(BELIEF, "can", encode(sample(BELIEF.type, object="can", step=0)))

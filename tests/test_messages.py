@@ -8,9 +8,9 @@ import msgpack
 import numpy as np
 import pytest
 
-from shared.messages import Action, Frame, Message, field_types
-from shared.topics import TOPICS
-from shared.wire import (
+from saccade.shared.bus.messages import Action, Frame, Message, field_types
+from saccade.shared.bus.topics import TOPICS
+from saccade.shared.bus.wire import (
     ARRAY_EXTENSION,
     MAX_BYTES,
     MAX_SIDE,
@@ -21,7 +21,7 @@ from shared.wire import (
     encode,
     stamp_of,
 )
-from tests.samples import array_fields, sample
+from saccade.tests.samples import array_fields, sample
 
 TYPES = sorted({topic.type for topic in TOPICS.values()}, key=lambda t: t.__name__)
 every_type = pytest.mark.parametrize("kind", TYPES, ids=lambda t: t.__name__)

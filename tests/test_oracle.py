@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from services.planner.motion import STEP_M, reach, step_towards, turn_towards, way_around
-from services.planner.oracle import Oracle
-from services.simulator.objects import YCB_NAMES, load_mesh, ycb_folder
-from services.simulator.scenes import PAPER_SCENES, generate_split, load_scenes
-from shared.geometry import look_at, rotation_angle, rotation_xyz
-from shared.messages import Truth
-from shared.task import LOWER_M, UPPER_M, Episode, Spheres, apply_action, clip, spheres_around, start_pose
-from shared.wire import encode
+from saccade.services.planner.motion import STEP_M, reach, step_towards, turn_towards, way_around
+from saccade.services.planner.oracle import Oracle
+from saccade.services.simulator.objects import YCB_NAMES, load_mesh, ycb_folder
+from saccade.services.simulator.scenes import PAPER_SCENES, generate_split, load_scenes
+from saccade.shared.bus.messages import Truth
+from saccade.shared.bus.wire import encode
+from saccade.shared.world.geometry import look_at, rotation_angle, rotation_xyz
+from saccade.shared.world.task import LOWER_M, UPPER_M, Episode, Spheres, apply_action, clip, spheres_around, start_pose
 
 SIZES = {"can": (0.10, 0.10, 0.14), "box": (0.07, 0.16, 0.21), "carton": (0.05, 0.09, 0.18), "tin": (0.07, 0.07, 0.10),
          "bottle": (0.10, 0.07, 0.19)}

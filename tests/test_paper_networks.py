@@ -9,10 +9,10 @@ import torch
 from rich.console import Console
 from torch import nn
 
-from deploy import cli
-from services.belief.core import BeliefFilter
-from services.perception.core import SceneCCN, build, model_of
-from services.perception.paper import (
+from saccade.app.cli import main as cli
+from saccade.services.belief.core import BeliefFilter
+from saccade.services.perception.core import SceneCCN, build, model_of
+from saccade.services.perception.paper import (
     CROP_SIDE_M,
     MaskNetwork,
     PaperExtraction,
@@ -21,20 +21,20 @@ from services.perception.paper import (
     median_pool,
     spatial_transform,
 )
-from shared.config import Config
-from shared.errors import SaccadeError
-from shared.generative_model import CCN, LATENT, PaperDecoder, Stacked, transition_of
-from shared.geometry import INTRINSICS_PX
-from shared.weights import MANIFEST, Weights
-from tests.fakes.training import assert_same_checkpoint, interrupt_and_resume
-from tests.fakes.weights import write_random_weights
-from training.ccn import goal_search_errors
-from training.checkpoints import ccn_of
-from training.dataset import load_views
-from training.paper_data import CleanViews, PaperFrames
-from training.part import Trainer
-from training.run import export, start, train
-from training.settings import TrainingConfig
+from saccade.shared.config import Config
+from saccade.shared.errors import SaccadeError
+from saccade.shared.model.generative_model import CCN, LATENT, PaperDecoder, Stacked, transition_of
+from saccade.shared.model.weights import MANIFEST, Weights
+from saccade.shared.world.geometry import INTRINSICS_PX
+from saccade.tests.fakes.training import assert_same_checkpoint, interrupt_and_resume
+from saccade.tests.fakes.weights import write_random_weights
+from saccade.training.ccn import goal_search_errors
+from saccade.training.checkpoints import ccn_of
+from saccade.training.dataset import load_views
+from saccade.training.paper_data import CleanViews, PaperFrames
+from saccade.training.part import Trainer
+from saccade.training.run import export, start, train
+from saccade.training.settings import TrainingConfig
 
 NAMES = ("soup_can", "rice_box")
 TINY = TrainingConfig(objects="pantry", names=NAMES, views=24, steps_ccn=4, steps_extraction=4, batch_ccn=4,
@@ -264,8 +264,10 @@ def test_the_composed_images_agree_with_their_labels(finished):
 @pytest.mark.parametrize(("architecture", "folder"), [("default", "pantry"), ("paper", "pantry-paper")])
 def test_the_command_keeps_the_architectures_apart(monkeypatch, architecture, folder):
     called = []
-    monkeypatch.setattr("training.run.train", lambda run_dir, settings, **_: called.append((run_dir.name, settings)))
-    monkeypatch.setattr("training.run.export", lambda run_dir, target: called.append((run_dir.name, target.name)))
+    monkeypatch.setattr("saccade.training.run.train", lambda run_dir, settings, **_: called.append(
+        (run_dir.name, settings)))
+    monkeypatch.setattr("saccade.training.run.export", lambda run_dir, target: called.append(
+        (run_dir.name, target.name)))
     cli.train(objects="pantry", names=",".join(NAMES), architecture=architecture)
     (run_name, settings), exported = called
     assert (run_name, settings.architecture, exported) == (folder, architecture, (folder, folder))

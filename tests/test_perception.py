@@ -4,21 +4,21 @@ import numpy as np
 import pytest
 import torch
 
-from services.perception.core import SceneCCN
-from services.perception.cropping import Cropper
-from services.simulator.objects import load_mesh, names_of
-from services.simulator.world import World
-from shared.config import REPOSITORY
-from shared.geometry import INTRINSICS_PX, direction, look_at, project
-from shared.weights import Weights
-from shared.windows import Window
+from saccade.services.perception.core import SceneCCN
+from saccade.services.perception.cropping import Cropper
+from saccade.services.simulator.objects import load_mesh, names_of
+from saccade.services.simulator.world import World
+from saccade.shared.config import WEIGHTS
+from saccade.shared.model.weights import Weights
+from saccade.shared.world.geometry import INTRINSICS_PX, direction, look_at, project
+from saccade.shared.world.windows import Window
 
 NAMES = names_of("pantry")
 
 
 @pytest.fixture(scope="module")
 def model():
-    return SceneCCN(Weights(REPOSITORY / "weights" / "pantry"), NAMES)
+    return SceneCCN(Weights(WEIGHTS / "pantry"), NAMES)
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +77,7 @@ def test_the_same_image_gives_the_same_bytes(model, world):
 
 def test_objects_together_are_seen_as_one_by_one(world):
     """Evaluating all networks in one batch gives what each gives alone."""
-    weights = Weights(REPOSITORY / "weights" / "pantry")
+    weights = Weights(WEIGHTS / "pantry")
     places = [(-0.2, -0.2), (0.2, 0.2), (-0.2, 0.2), (0.2, -0.2), (0.0, 0.0)]
     world.place({n: (stand(world, n, *p), 0.3) for n, p in zip(NAMES, places, strict=True)}, (60, 160, 90))
     camera = look_at((0.45, 0.0, 0.5), (0, 0, 0))

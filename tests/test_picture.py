@@ -9,12 +9,13 @@ import pytest
 from matplotlib.colors import to_rgb
 from PIL import Image
 
-from deploy.picture import COLOURS, draw, read_story
-from shared.errors import SaccadeError
-from shared.messages import Belief, Frame, Goal, Truth
-from shared.recording import RunLog
-from shared.topics import BELIEF, FRAME, GOAL, TRUTH
-from shared.wire import encode
+from saccade.app.look.picture import draw, read_story
+from saccade.app.palette import COLOURS
+from saccade.shared.bus.messages import Belief, Frame, Goal, Truth
+from saccade.shared.bus.topics import BELIEF, FRAME, GOAL, TRUTH
+from saccade.shared.bus.wire import encode
+from saccade.shared.errors import SaccadeError
+from saccade.shared.log.recording import RunLog
 
 RNG = np.random.default_rng(0)
 

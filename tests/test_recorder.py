@@ -14,16 +14,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deploy.logs.check import missing
-from shared.bus import ZenohBus, free_endpoint
-from shared.config import Config
-from shared.outbox import Outbox
-from shared.reading import RunReader
-from shared.recording import RunLog
-from shared.topics import ACTION, GOAL, PERCEPT, RESULT, STATUS
-from shared.wire import encode
-from tests.fakes.logs import so_far
-from tests.samples import sample
+from saccade.app.log.check import missing
+from saccade.shared.bus.outbox import Outbox
+from saccade.shared.bus.topics import ACTION, GOAL, PERCEPT, RESULT, STATUS
+from saccade.shared.bus.transport import ZenohBus, free_endpoint
+from saccade.shared.bus.wire import encode
+from saccade.shared.config import Config
+from saccade.shared.log.reading import RunReader
+from saccade.shared.log.recording import RunLog
+from saccade.tests.fakes.logs import so_far
+from saccade.tests.samples import sample
 
 WAIT_S = 60
 MOST_LOST_S = 1.0  # what a killed recorder may lose
@@ -40,7 +40,8 @@ class RecorderProcess:
         folder.mkdir(exist_ok=True)
         Config().with_values({"bus.endpoint": endpoint, "bus.world": "test"}).save(folder / "config.json")
         limit = (lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit_bytes,) * 2)) if limit_bytes else None
-        self.process = subprocess.Popen([sys.executable, "-m", "services.recorder", "--config", folder / "config.json"],
+        self.process = subprocess.Popen([sys.executable, "-m", "saccade.services.recorder", "--config",
+                                         folder / "config.json"],
                                         stderr=subprocess.PIPE, text=True, preexec_fn=limit)
         self.until(lambda: b"ready" in b"".join(self.said))
 

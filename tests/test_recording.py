@@ -11,15 +11,15 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 
-from deploy.logs.check import missing
-from shared.errors import SaccadeError
-from shared.messages import field_types
-from shared.migrations import FORMAT
-from shared.reading import RunReader
-from shared.recording import RecordingStopped, RunLog, json_schema
-from shared.topics import ACTION, BELIEF, FRAME, GOAL, PERCEPT, RESULT, STATUS, TOPICS, TRUTH
-from shared.wire import encode
-from tests.samples import sample
+from saccade.app.log.check import missing
+from saccade.shared.bus.messages import field_types
+from saccade.shared.bus.topics import ACTION, BELIEF, FRAME, GOAL, PERCEPT, RESULT, STATUS, TOPICS, TRUTH
+from saccade.shared.bus.wire import encode
+from saccade.shared.errors import SaccadeError
+from saccade.shared.log.migrations import FORMAT
+from saccade.shared.log.reading import RunReader
+from saccade.shared.log.recording import RecordingStopped, RunLog, json_schema
+from saccade.tests.samples import sample
 
 
 def write(path: Path, messages, **options) -> RunLog:
@@ -150,10 +150,10 @@ def test_a_full_disk_stops_the_recording_once_and_keeps_what_there_is(tmp_path):
 FILL = """
 import resource, sys, pathlib
 import numpy as np
-from shared.wire import encode
-from shared.recording import RecordingStopped, RunLog
-from shared.topics import FRAME
-from tests.samples import sample
+from saccade.shared.bus.wire import encode
+from saccade.shared.log.recording import RecordingStopped, RunLog
+from saccade.shared.bus.topics import FRAME
+from saccade.tests.samples import sample
 resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000))
 log, noise = RunLog(pathlib.Path(sys.argv[1]), world="test"), np.random.default_rng(0)
 written = stopped = 0

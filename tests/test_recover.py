@@ -12,15 +12,15 @@ from mcap.reader import make_reader
 from mcap.records import Channel, Message
 from mcap.writer import CompressionType, Writer
 
-from deploy.logs.check import missing
-from deploy.logs.recover import RECOVERED, recover
-from deploy.logs.salvage import Salvage
-from shared.errors import SaccadeError
-from shared.reading import RunReader
-from shared.recording import RecordingStopped, RunLog
-from shared.topics import ACTION, PERCEPT
-from shared.wire import encode
-from tests.samples import sample
+from saccade.app.log.check import missing
+from saccade.app.log.recover import RECOVERED, recover
+from saccade.app.log.salvage import Salvage
+from saccade.shared.bus.topics import ACTION, PERCEPT
+from saccade.shared.bus.wire import encode
+from saccade.shared.errors import SaccadeError
+from saccade.shared.log.reading import RunReader
+from saccade.shared.log.recording import RecordingStopped, RunLog
+from saccade.tests.samples import sample
 
 CHUNKS, EACH = 5, 3
 

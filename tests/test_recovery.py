@@ -14,16 +14,16 @@ from pathlib import Path
 
 import pytest
 
-from deploy.launch import PROCESSES, launch
-from deploy.logs.check import missing
-from deploy.registry import local_pairs
-from shared.config import Config
-from shared.local import run_local
-from shared.reading import RunReader
-from shared.topics import FRAME, STATUS
-from shared.wire import stamp_of
-from tests.fakes.launch import FAKES, PARTS, configuration, processes_of
-from tests.fakes.services import pairs
+from saccade.app.log.check import missing
+from saccade.app.run.launch import PROCESSES, launch
+from saccade.app.run.registry import local_pairs
+from saccade.shared.bus.topics import FRAME, STATUS
+from saccade.shared.bus.wire import stamp_of
+from saccade.shared.config import Config
+from saccade.shared.log.reading import RunReader
+from saccade.shared.loop.local import run_local
+from saccade.tests.fakes.launch import FAKES, PARTS, configuration, processes_of
+from saccade.tests.fakes.services import pairs
 
 EPISODES, STEPS = 3, 12
 NAMES = [process.name for process in PROCESSES]
@@ -81,7 +81,7 @@ def test_a_service_killed_at_any_moment_goes_on_where_it_was(tmp_path, name):
 
 
 def test_a_service_that_hangs_is_named_and_goes_on_when_it_is_let(tmp_path, monkeypatch):
-    monkeypatch.setattr("deploy.supervisor.HUNG_KILLED_S", 1e9)
+    monkeypatch.setattr("saccade.app.run.supervisor.HUNG_KILLED_S", 1e9)
     run_dir, said = tmp_path / "run", []
     stopped = []
 
@@ -101,7 +101,7 @@ def test_a_service_that_hangs_is_named_and_goes_on_when_it_is_let(tmp_path, monk
 
 
 def test_a_service_that_hangs_for_long_is_ended_and_started_again(tmp_path, monkeypatch):
-    monkeypatch.setattr("deploy.supervisor.HUNG_KILLED_S", 3.0)
+    monkeypatch.setattr("saccade.app.run.supervisor.HUNG_KILLED_S", 3.0)
     run_dir = tmp_path / "run"
     results, said = disturbed(
         run_dir, {(0, 0): lambda: os.kill(processes_of(run_dir)["perception"], signal.SIGSTOP)})
@@ -112,7 +112,7 @@ def test_a_service_that_hangs_for_long_is_ended_and_started_again(tmp_path, monk
 
 def test_a_launcher_that_was_suspended_blames_nobody(tmp_path):
     run_dir = tmp_path / "run"
-    launcher = subprocess.Popen([sys.executable, "-m", "tests.fakes.launch", str(run_dir), "1", "3000"],
+    launcher = subprocess.Popen([sys.executable, "-m", "saccade.tests.fakes.launch", str(run_dir), "1", "3000"],
                                 stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     try:
         while "recorder" not in processes_of(run_dir):

@@ -12,17 +12,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deploy.comparison import Comparison, differences
-from deploy.logs.check import missing
-from deploy.replay import REPLAYABLE
-from deploy.tolerances import TOLERANCES, tolerance_of
-from shared.messages import field_types
-from shared.reading import RunReader
-from shared.recording import RunLog
-from shared.topics import ACTION, BELIEF, FRAME, GOAL_PERCEPT, PERCEPT, STATUS, TOPICS
-from shared.wire import encode
-from tests.fixtures.make import GOLDEN, IN_WORDS, WORDS, changes, in_words
-from tests.samples import sample
+from saccade.app.log.check import missing
+from saccade.app.replay.comparison import Comparison, differences
+from saccade.app.replay.replay import REPLAYABLE
+from saccade.app.replay.tolerances import TOLERANCES, tolerance_of
+from saccade.shared.bus.messages import field_types
+from saccade.shared.bus.topics import ACTION, BELIEF, FRAME, GOAL_PERCEPT, PERCEPT, STATUS, TOPICS
+from saccade.shared.bus.wire import encode
+from saccade.shared.log.reading import RunReader
+from saccade.shared.log.recording import RunLog
+from saccade.tests.fixtures.make import GOLDEN, IN_WORDS, WORDS, changes, in_words
+from saccade.tests.samples import sample
 
 FORMAT_1, FORMAT_2 = GOLDEN.with_name("format_1.mcap"), GOLDEN.with_name("format_2.mcap")
 WAIT_S = 300
@@ -30,8 +30,9 @@ WAIT_S = 300
 
 def saccade(*arguments: str | Path, keys: str = "") -> subprocess.CompletedProcess:
     """`saccade replay` as a user gives it, with these key presses."""
-    return subprocess.run([sys.executable, "-m", "deploy.cli", "replay", *map(str, arguments)], capture_output=True,
-                          text=True, input=keys, timeout=WAIT_S, env=os.environ | {"COLUMNS": "200"})
+    return subprocess.run([sys.executable, "-m", "saccade", "replay", *map(str, arguments)],
+                          capture_output=True, text=True, input=keys, timeout=WAIT_S,
+                          env=os.environ | {"COLUMNS": "200"})
 
 
 def messages(log: Path, *topics) -> list:

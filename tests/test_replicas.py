@@ -9,16 +9,16 @@ from contextlib import suppress
 
 import pytest
 
-from shared.bus import LocalBus
-from shared.errors import SaccadeError
-from shared.loop import serve
-from shared.outbox import Outbox
-from shared.process import Inbox
-from shared.replicas import Share, alone_on, shares
-from shared.service import Output, Service
-from shared.topics import FRAME, GOAL, GOAL_PERCEPT, PERCEPT
-from shared.wire import MessageError, decode, encode, stamp_of
-from tests.samples import sample
+from saccade.shared.bus.outbox import Outbox
+from saccade.shared.bus.topics import FRAME, GOAL, GOAL_PERCEPT, PERCEPT, Output
+from saccade.shared.bus.transport import LocalBus
+from saccade.shared.bus.wire import MessageError, decode, encode, stamp_of
+from saccade.shared.errors import SaccadeError
+from saccade.shared.loop.main import serve
+from saccade.shared.loop.process import Inbox
+from saccade.shared.loop.replicas import Share, alone_on, shares
+from saccade.shared.loop.service import Service
+from saccade.tests.samples import sample
 
 PARTS = ("cup", "jar", "jug", "mug", "pot")
 SERVICE = Service("divided", inputs=(FRAME, GOAL), trigger=FRAME, outputs=(PERCEPT, GOAL_PERCEPT), divisible=True)

@@ -11,19 +11,19 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
-from deploy.bench import bench, prepare
-from deploy.failures import CLASSES, Diagnosis, Distance, diagnose, section
-from deploy.picture import Story
-from deploy.report import conduct, report, side_by_side, training
-from deploy.report_pictures import draw_exploration, explore, pick
-from deploy.rerun import prepare_again, read_results, replay, same_as
-from shared.config import REPOSITORY, Config
-from shared.errors import SaccadeError
-from shared.geometry import direction, look_at, viewing_grid
-from shared.messages import Belief, Plan, Result, Truth
-from shared.weights import Weights
-from tests.fakes.weights import write_random_weights
-from tests.samples import sample
+from saccade.app.bench.bench import bench, prepare
+from saccade.app.bench.charts import draw_exploration, explore, pick
+from saccade.app.bench.failures import CLASSES, Diagnosis, Distance, diagnose, section
+from saccade.app.bench.repeat import prepare_again, read_results, replay, same_as
+from saccade.app.bench.report import conduct, report, side_by_side, training
+from saccade.app.look.picture import Story
+from saccade.shared.bus.messages import Belief, Plan, Result, Truth
+from saccade.shared.config import WEIGHTS, Config
+from saccade.shared.errors import SaccadeError
+from saccade.shared.model.weights import Weights
+from saccade.shared.world.geometry import direction, look_at, viewing_grid
+from saccade.tests.fakes.weights import write_random_weights
+from saccade.tests.samples import sample
 
 
 def record(scene, success=True, azimuth=0.1, steps=10, **more):
@@ -95,7 +95,7 @@ def test_runs_of_the_same_scenes_are_compared_one_by_one(tmp_path):
 
 def test_training_is_told_of_the_weights_that_made_the_results(tmp_path):
     """By the shipped manifest; a file that other weights made says nothing."""
-    weights = Weights(REPOSITORY / "weights" / "pantry")
+    weights = Weights(WEIGHTS / "pantry")
     config = Config().with_values({"scene.objects": "pantry"}).model_dump(mode="json")
     own = write(tmp_path / "own.json", [record("a")], config=config, weights=weights.hashes)
     other = write(tmp_path / "other.json", [record("a")], config=config)

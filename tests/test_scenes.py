@@ -7,8 +7,8 @@ import json
 import numpy as np
 import pytest
 
-from services.simulator.objects import YCB_NAMES
-from services.simulator.scenes import (
+from saccade.services.simulator.objects import YCB_NAMES
+from saccade.services.simulator.scenes import (
     PAPER_SCENES,
     generate_scene,
     generate_split,
@@ -16,9 +16,9 @@ from services.simulator.scenes import (
     overlapping,
     save_scenes,
 )
-from shared.errors import SaccadeError
-from shared.geometry import rotation_angle, rotation_towards
-from shared.task import LOWER_M, UPPER_M, spheres_around
+from saccade.shared.errors import SaccadeError
+from saccade.shared.world.geometry import rotation_angle, rotation_towards
+from saccade.shared.world.task import LOWER_M, UPPER_M, spheres_around
 
 SIZES = {"can": (0.10, 0.10, 0.14), "box": (0.07, 0.16, 0.21), "carton": (0.05, 0.09, 0.18), "tin": (0.07, 0.07, 0.10),
          "bottle": (0.10, 0.07, 0.19)}

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from shared.sequences import Sequences
-from shared.topics import PERCEPT, STATUS
-from tests.samples import sample
+from saccade.shared.bus.sequences import Sequences
+from saccade.shared.bus.topics import PERCEPT, STATUS
+from saccade.tests.samples import sample
 
 
 def take(sequences: Sequences, *numbers: tuple[int, int], part: str = "mug") -> list:

@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from services.simulator.core import SERVICE, Simulator, build, names_in_use, scenes_of
-from services.simulator.objects import load_mesh
-from services.simulator.scenes import generate_scene, save_scenes
-from services.simulator.world import World
-from shared.config import Config
-from shared.errors import SaccadeError
-from shared.geometry import look_at
-from shared.images import read_goal_image
-from shared.messages import Action
-from shared.task import start_pose
-from shared.wire import decode, encode
+from saccade.services.simulator.core import SERVICE, Simulator, build, names_in_use, scenes_of
+from saccade.services.simulator.objects import load_mesh
+from saccade.services.simulator.scenes import generate_scene, save_scenes
+from saccade.services.simulator.world import World
+from saccade.shared.bus.messages import Action
+from saccade.shared.bus.wire import decode, encode
+from saccade.shared.config import Config
+from saccade.shared.errors import SaccadeError
+from saccade.shared.world.geometry import look_at
+from saccade.shared.world.images import read_goal_image
+from saccade.shared.world.task import start_pose
 
 NAMES = ("soup_can", "rice_box")
 

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from benchmarks import soak
+from saccade.benchmarks import soak
 
 WHOLE = {"episodes": 6, "messages": 900, "killed: belief": 2} | dict.fromkeys(soak.FAULTS, 0)
 

@@ -7,13 +7,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from shared.service import Service
-from shared.stepper import Stepper, settle
-from shared.topics import ACTION, FRAME, GOAL, PERCEPT, PLAN, TRUTH
-from shared.wire import MessageError, encode
-from tests.fakes.services import SIMULATOR, FakeSimulator
-from tests.fakes.timed import TIMED, FakeCamera
-from tests.samples import sample
+from saccade.shared.bus.topics import ACTION, FRAME, GOAL, PERCEPT, PLAN, TRUTH
+from saccade.shared.bus.wire import MessageError, encode
+from saccade.shared.loop.service import Service
+from saccade.shared.loop.stepper import Stepper, settle
+from saccade.tests.fakes.services import SIMULATOR, FakeSimulator
+from saccade.tests.fakes.timed import TIMED, FakeCamera
+from saccade.tests.samples import sample
 
 PARTS = ("mug", "can")
 

@@ -8,10 +8,10 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from deploy.suites import SUITES, default_suite, suite_file
-from services.simulator.scenes import PAPER_SCENES, load_scenes, overlapping
-from shared.config import Config
-from shared.errors import SaccadeError
+from saccade.app.bench.suites import SUITES, default_suite, suite_file
+from saccade.services.simulator.scenes import PAPER_SCENES, load_scenes, overlapping
+from saccade.shared.config import Config
+from saccade.shared.errors import SaccadeError
 
 SIZES = {"can": (0.10, 0.10, 0.14), "box": (0.07, 0.16, 0.21), "carton": (0.05, 0.09, 0.18), "tin": (0.07, 0.07, 0.10),
          "bottle": (0.10, 0.07, 0.19)}

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from shared.geometry import look_at, pose, rotation_angle, rotation_xyz, spherical
-from shared.task import (
+from saccade.shared.world.geometry import look_at, pose, rotation_angle, rotation_xyz, spherical
+from saccade.shared.world.task import (
     LOWER_M,
     MAX_STEPS,
     UPPER_M,

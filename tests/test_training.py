@@ -7,19 +7,19 @@ import pytest
 import torch
 from rich.console import Console
 
-from services.perception.core import SceneCCN
-from shared.errors import SaccadeError
-from shared.geometry import IMAGE_SIZE_PX, INTRINSICS_PX
-from shared.weights import Weights
-from tests.fakes.training import assert_same_checkpoint, interrupt_and_resume
-from training.crops import CropComposer
-from training.dataset import load_views
-from training.frames import FrameComposer
-from training.part import Trainer, pick_device
-from training.run import export, start, train
-from training.settings import EXTRACTION, TrainingConfig
-from training.strangers import recoloured
-from training.tasks import CcnTask
+from saccade.services.perception.core import SceneCCN
+from saccade.shared.errors import SaccadeError
+from saccade.shared.model.weights import Weights
+from saccade.shared.world.geometry import IMAGE_SIZE_PX, INTRINSICS_PX
+from saccade.tests.fakes.training import assert_same_checkpoint, interrupt_and_resume
+from saccade.training.crops import CropComposer
+from saccade.training.dataset import load_views
+from saccade.training.frames import FrameComposer
+from saccade.training.part import Trainer, pick_device
+from saccade.training.run import export, start, train
+from saccade.training.settings import EXTRACTION, TrainingConfig
+from saccade.training.strangers import recoloured
+from saccade.training.tasks import CcnTask
 
 NAMES = ("soup_can", "rice_box")
 TINY = TrainingConfig(objects="pantry", names=NAMES, views=24, steps_ccn=4, steps_extraction=4, batch_ccn=8,

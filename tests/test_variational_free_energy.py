@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from services.belief.free_energy import crop_term, gaussian_kl, identity_term, pose_term, position_term
-from services.belief.position import PositionFilter
-from tests.test_belief import CONFIG, TRUE, Turning, cameras, latent_of, percept
+from saccade.services.belief.free_energy import crop_term, gaussian_kl, identity_term, pose_term, position_term
+from saccade.services.belief.position import PositionFilter
+from saccade.tests.test_belief import CONFIG, TRUE, Turning, cameras, latent_of, percept
 
 
 def test_gaussian_kl_equals_torchs():

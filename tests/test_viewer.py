@@ -12,20 +12,20 @@ import pytest
 import rerun as rr
 from rerun.chunk import RrdReader
 
-from deploy.run import run
-from services.viewer.core import Viewer
-from services.viewer.curves import F_TERMS, G_TERMS, entropy_nats
-from services.viewer.images import outline
-from services.viewer.words import decision, plain
-from services.viewer.world import PATH_LENGTH
-from shared.config import Config
-from shared.geometry import look_at
-from shared.reading import RunReader
-from shared.topics import BELIEF, FRAME, PERCEPT, PLAN, STATUS, TRUTH
-from tests.fakes.logs import story, write
-from tests.fixtures.make import GOLDEN
-from tests.front_door import call
-from tests.samples import sample
+from saccade.app.run.run import run
+from saccade.services.viewer.core import Viewer
+from saccade.services.viewer.curves import F_TERMS, G_TERMS, entropy_nats
+from saccade.services.viewer.images import outline
+from saccade.services.viewer.words import decision, plain
+from saccade.services.viewer.world import PATH_LENGTH
+from saccade.shared.bus.topics import BELIEF, FRAME, PERCEPT, PLAN, STATUS, TRUTH
+from saccade.shared.config import Config
+from saccade.shared.log.reading import RunReader
+from saccade.shared.world.geometry import look_at
+from saccade.tests.fakes.logs import story, write
+from saccade.tests.fixtures.make import GOLDEN
+from saccade.tests.front_door import call
+from saccade.tests.samples import sample
 
 NAMES = ("soup_can", "rice_box")
 
@@ -172,7 +172,7 @@ def test_what_is_seen_stands_on_the_image_it_was_seen_in(monkeypatch, tmp_path):
     recording, drawn = rr.RecordingStream("saccade"), []
     recording.save(tmp_path / "run.rrd")
     viewer = Viewer(recording, Config(scene={"names": NAMES[:1]}), truth=False, live=False)
-    monkeypatch.setattr("services.viewer.core.Images.step", lambda self, frame, percepts: drawn.append(
+    monkeypatch.setattr("saccade.services.viewer.core.Images.step", lambda self, frame, percepts: drawn.append(
         (frame.step, {percept.step for percept in percepts.values()})))
     told = [("frame", 0), ("frame", 1), ("percept", 0), ("frame", 2), ("frame", 3), ("belief", 0), ("percept", 2),
             ("percept", 4), ("frame", 4), ("belief", 2), ("frame", 5), ("frame", 6), ("percept", 6)]
@@ -194,7 +194,7 @@ def test_live_crops_are_drawn_now_and_then_only(monkeypatch, tmp_path):
     """A browser is sent something twice a second: ten steps a second need not all be drawn."""
     recording, now_s = rr.RecordingStream("saccade"), 0.0
     recording.save(tmp_path / "run.rrd")
-    monkeypatch.setattr("services.viewer.core.time", SimpleNamespace(monotonic=lambda: now_s))
+    monkeypatch.setattr("saccade.services.viewer.core.time", SimpleNamespace(monotonic=lambda: now_s))
     viewer = Viewer(recording, Config(scene={"names": NAMES}), truth=False, live=True)
     for step in range(12):
         viewer.take(FRAME, None, sample(FRAME.type, run="r", episode=0, step=step))

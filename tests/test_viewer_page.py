@@ -19,12 +19,12 @@ import pytest
 from PIL import Image
 from playwright.sync_api import sync_playwright
 
-from services.viewer.server import binary, free_port, listens
-from shared.config import REPOSITORY
-from tests.fixtures.make import GOLDEN
-from tests.test_viewer import Seen
+from saccade.services.viewer.server import binary, free_port, listens
+from saccade.shared.config import PACKAGE
+from saccade.tests.fixtures.make import GOLDEN
+from saccade.tests.test_viewer import Seen
 
-ARTEFACTS = REPOSITORY / "artefacts"
+ARTEFACTS = PACKAGE / "artefacts"
 WAIT_S = 300
 FLAGS = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 SIZE = {"width": 1400, "height": 860}
@@ -52,7 +52,7 @@ def browser():
 @contextmanager
 def saccade(*arguments: object):
     """A command of ours, interrupted at the end."""
-    child = subprocess.Popen([sys.executable, "-m", "deploy.cli", *map(str, arguments)], text=True,
+    child = subprocess.Popen([sys.executable, "-m", "saccade", *map(str, arguments)], text=True,
                              stdout=subprocess.PIPE, stderr=subprocess.STDOUT, env=os.environ | {"COLUMNS": "200"})
     try:
         yield child

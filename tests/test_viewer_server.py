@@ -18,11 +18,11 @@ import psutil
 import pytest
 import rerun as rr
 
-from services.viewer.door import host_of
-from services.viewer.live import connected
-from services.viewer.server import Server, free_port, listens, url_of, with_free_ports
-from shared.config import Config
-from shared.errors import SaccadeError
+from saccade.services.viewer.door import host_of
+from saccade.services.viewer.live import connected
+from saccade.services.viewer.server import Server, free_port, listens, url_of, with_free_ports
+from saccade.shared.config import Config
+from saccade.shared.errors import SaccadeError
 
 WAIT_S = 30
 MEBI = 2 ** 20
@@ -118,7 +118,7 @@ def test_a_port_that_is_taken_is_said_in_one_line():
 
 
 def test_without_rerun_it_says_what_to_install(monkeypatch):
-    monkeypatch.setattr("services.viewer.server.find_spec", lambda name: None)
+    monkeypatch.setattr("saccade.services.viewer.server.find_spec", lambda name: None)
     with pytest.raises(SaccadeError, match=r"pip install 'saccade\[viewer\]'"):
         Server(configured())
 
@@ -126,7 +126,7 @@ def test_without_rerun_it_says_what_to_install(monkeypatch):
 @pytest.mark.skipif(sys.platform != "linux", reason="sessions' niceness is Linux's")
 @pytest.mark.parametrize("own_session", [True, False])
 def test_who_looks_on_comes_last_and_its_terminal_does_not(own_session):
-    code = ("import os\nfrom services.viewer.priority import SESSION, come_last\n"
+    code = ("import os\nfrom saccade.services.viewer.priority import SESSION, come_last\n"
             "def nice(): return (SESSION.read_text().split() or [None])[-1] if SESSION.exists() else None\n"
             "before = nice()\ncome_last()\nprint(os.sched_getscheduler(0) == os.SCHED_IDLE, before, nice())")
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, start_new_session=own_session)
@@ -137,7 +137,7 @@ def test_who_looks_on_comes_last_and_its_terminal_does_not(own_session):
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere a killed process leaves its children")
 def test_a_viewer_that_is_killed_takes_its_server_along():
-    code = ("from tests.test_viewer_server import Server, configured, time\n"
+    code = ("from saccade.tests.test_viewer_server import Server, configured, time\n"
             "with Server(configured()) as s: print(s.data_port, flush=True); time.sleep(600)")
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as viewer:
         port = int(viewer.stdout.readline())

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from services.camera.virtual_camera import FILL, VirtualCamera, assumed_intrinsics
-from shared.geometry import INTRINSICS_PX, project
-from tests.fakes.camera import HERE, centroid, complaint, dots
+from saccade.services.camera.virtual_camera import FILL, VirtualCamera, assumed_intrinsics
+from saccade.shared.world.geometry import INTRINSICS_PX, project
+from saccade.tests.fakes.camera import HERE, centroid, complaint, dots
 
 
 @pytest.mark.parametrize(("size", "intrinsics"), [

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from services.perception.networks import Identity
-from shared.config import REPOSITORY
-from shared.errors import SaccadeError
-from shared.generative_model import CCN, Transition
-from shared.latent import PREFIX, LatentTransition
-from shared.weights import MANIFEST, ObjectCard, Weights, write_weights
+from saccade.services.perception.networks import Identity
+from saccade.shared.config import WEIGHTS
+from saccade.shared.errors import SaccadeError
+from saccade.shared.model.generative_model import CCN, Transition
+from saccade.shared.model.latent import PREFIX, LatentTransition
+from saccade.shared.model.weights import MANIFEST, ObjectCard, Weights, write_weights
 
-SHIPPED = [REPOSITORY / "weights" / name for name in ("pantry", "ycb")]
+SHIPPED = [WEIGHTS / name for name in ("pantry", "ycb")]
 
 
 @pytest.fixture

@@ -14,17 +14,17 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from deploy.bench import bench, prepare
-from deploy.workers import in_processes
-from shared.config import Config
-from shared.errors import SaccadeError
-from tests.test_bench import timeless
+from saccade.app.bench.bench import bench, prepare
+from saccade.app.bench.workers import in_processes
+from saccade.shared.config import Config
+from saccade.shared.errors import SaccadeError
+from saccade.tests.test_bench import timeless
 
 WORK = {f"scene {k}": (k,) for k in range(6)}
 INTERRUPTED = """
 import sys, time
-from deploy.workers import in_processes
-from tests.test_workers import slow
+from saccade.app.bench.workers import in_processes
+from saccade.tests.test_workers import slow
 for scene, process in in_processes(slow, {str(k): (k,) for k in range(50)}, 2):
     print(process, flush=True)
 """

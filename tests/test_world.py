@@ -7,12 +7,12 @@ import ctypes.util
 import numpy as np
 import pytest
 
-from services.simulator.mesh import Mesh
-from services.simulator.objects import load_mesh, names_of, ycb_folder
-from services.simulator.opengl import choose_backend
-from services.simulator.world import FAR_M, World
-from shared.errors import SaccadeError
-from shared.geometry import INTRINSICS_PX, look_at, pixel_rays, project
+from saccade.services.simulator.mesh import Mesh
+from saccade.services.simulator.objects import load_mesh, names_of, ycb_folder
+from saccade.services.simulator.opengl import choose_backend
+from saccade.services.simulator.world import FAR_M, World
+from saccade.shared.errors import SaccadeError
+from saccade.shared.world.geometry import INTRINSICS_PX, look_at, pixel_rays, project
 
 TABLE_RGB = (37, 201, 118)
 CAMERAS = (look_at([0.45, 0.05, 0.4], [0.0, 0.0, 0.05]), look_at([-0.25, 0.5, 0.2], [0.0, 0.0, 0.08]),

@@ -10,9 +10,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from services.perception.networks import Identity
-from shared.generative_model import CCN, kl_divergence, log_density
-from training.crops import CropBatch, CropComposer
+from saccade.services.perception.networks import Identity
+from saccade.shared.model.generative_model import CCN, kl_divergence, log_density
+from saccade.training.crops import CropBatch, CropComposer
 
 TOLERANCE = 40.0  # GECO: squared error summed over a crop that is good enough
 LAMBDA_RANGE = (80.0, 100.0)

@@ -9,9 +9,9 @@ from safetensors import safe_open
 from safetensors.torch import load_file
 from torch import Tensor, from_numpy
 
-from shared.errors import SaccadeError
-from shared.weights import Weights
-from training.settings import TrainingConfig
+from saccade.shared.errors import SaccadeError
+from saccade.shared.model.weights import Weights
+from saccade.training.settings import TrainingConfig
 
 CHECKPOINT = "checkpoint.safetensors"
 

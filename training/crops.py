@@ -13,9 +13,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from services.simulator.views import ObjectViews
-from shared.windows import CROP_PX
-from training.strangers import strangers
+from saccade.services.simulator.views import ObjectViews
+from saccade.shared.world.windows import CROP_PX
+from saccade.training.strangers import strangers
 
 REFERENCE_SHELL = 2  # index of the paper's 0.40 m among the shells
 

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from services.simulator.objects import load_mesh
-from services.simulator.views import ObjectViews, default_shells_m, render_views
-from shared.errors import SaccadeError
-from training.settings import TrainingConfig
+from saccade.services.simulator.objects import load_mesh
+from saccade.services.simulator.views import ObjectViews, default_shells_m, render_views
+from saccade.shared.errors import SaccadeError
+from saccade.training.settings import TrainingConfig
 
 
 def path_of(run_dir: Path, name: str) -> Path:

@@ -7,8 +7,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from services.perception.networks import CELLS, Extraction, tally
-from training.frames import FrameBatch
+from saccade.services.perception.networks import CELLS, Extraction, tally
+from saccade.training.frames import FrameBatch
 
 SEEN, HIDDEN = 0.2, 0.04  # shares: above the first an object is present, below the second absent, between no label
 

@@ -14,9 +14,9 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
-from services.perception.networks import INPUT_PX, MASK_PX
-from services.simulator.views import TILE_PX, ObjectViews
-from shared.geometry import (
+from saccade.services.perception.networks import INPUT_PX, MASK_PX
+from saccade.services.simulator.views import TILE_PX, ObjectViews
+from saccade.shared.world.geometry import (
     IMAGE_SIZE_PX,
     INTRINSICS_PX,
     REFERENCE_RANGE_M,
@@ -27,7 +27,7 @@ from shared.geometry import (
     rotation_towards,
     spherical,
 )
-from training.strangers import strangers, texture
+from saccade.training.strangers import strangers, texture
 
 LEVELS = 4  # of the tile pyramid: 128, 64, 32, 16 pixels
 GOAL_LIKE = 0.25  # share of images as goals show them: one object, from any elevation alike

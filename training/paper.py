@@ -8,17 +8,17 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from services.perception.paper import PaperExtraction
-from services.simulator.views import ObjectViews
-from shared.generative_model import CCN, kl_divergence
-from shared.windows import CROP_PX
-from training.ccn import loss_l1, sample_pair, wrapped
-from training.extraction import HIDDEN, SEEN, errors
-from training.frames import FrameBatch
-from training.paper_data import CleanViews, PaperFrames
-from training.pictures import draw_paper_extraction
-from training.settings import TrainingConfig
-from training.tasks import CcnTask, generator_of, split
+from saccade.services.perception.paper import PaperExtraction
+from saccade.services.simulator.views import ObjectViews
+from saccade.shared.model.generative_model import CCN, kl_divergence
+from saccade.shared.world.windows import CROP_PX
+from saccade.training.ccn import loss_l1, sample_pair, wrapped
+from saccade.training.extraction import HIDDEN, SEEN, errors
+from saccade.training.frames import FrameBatch
+from saccade.training.paper_data import CleanViews, PaperFrames
+from saccade.training.pictures import draw_paper_extraction
+from saccade.training.settings import TrainingConfig
+from saccade.training.tasks import CcnTask, generator_of, split
 
 KL_TRANSITION = 10.0  # lambda_4 (table of optimisation)
 MASKING, CROPPING, IDENTIFICATION = 10.0, 10.0, 10.0  # of errors summed over 64 x 64 x 3, as those of phase 1 are

@@ -10,11 +10,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from services.perception.paper import CANVAS_PX, CROP_SIDE_M
-from services.simulator.views import TILE_PX, ObjectViews
-from shared.windows import CROP_PX
-from training.crops import REFERENCE_SHELL, warp
-from training.frames import FrameBatch
+from saccade.services.perception.paper import CANVAS_PX, CROP_SIDE_M
+from saccade.services.simulator.views import TILE_PX, ObjectViews
+from saccade.shared.world.windows import CROP_PX
+from saccade.training.crops import REFERENCE_SHELL, warp
+from saccade.training.frames import FrameBatch
 
 SCALES = (0.283, 4.0)  # 0.40 m / range, of every object in an image; the ranges are even, which the paper leaves open
 EMPTY = 0.3  # share of the images without the object

@@ -1,6 +1,6 @@
 """Trains one part (the CCN and identity network of an object, or the extraction network) in one process.
 
-    python -m training.part RUN_DIR PART
+    python -m saccade.training.part RUN_DIR PART
 
 Every step draws its randomness from (seed, part, step), so that a run that was interrupted goes on exactly.
 """
@@ -18,14 +18,14 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from services.simulator.views import ObjectViews
-from shared.errors import SaccadeError
-from shared.provenance import commit
-from training.checkpoints import CHECKPOINT, ccn_of, model_of, read_checkpoint
-from training.dataset import load_views
-from training.paper import PaperCcnTask, PaperExtractionTask
-from training.settings import TrainingConfig, load_settings
-from training.tasks import CcnTask, ExtractionTask
+from saccade.services.simulator.views import ObjectViews
+from saccade.shared.errors import SaccadeError
+from saccade.shared.log.provenance import commit
+from saccade.training.checkpoints import CHECKPOINT, ccn_of, model_of, read_checkpoint
+from saccade.training.dataset import load_views
+from saccade.training.paper import PaperCcnTask, PaperExtractionTask
+from saccade.training.settings import TrainingConfig, load_settings
+from saccade.training.tasks import CcnTask, ExtractionTask
 
 SMOOTHING = 0.99
 

@@ -10,11 +10,11 @@ import torch.nn.functional as F
 from PIL import Image
 from torch import Tensor
 
-from services.perception.networks import Extraction, tally
-from services.perception.paper import PaperExtraction
-from shared.generative_model import CCN
-from training.ccn import Pair
-from training.frames import FrameBatch
+from saccade.services.perception.networks import Extraction, tally
+from saccade.services.perception.paper import PaperExtraction
+from saccade.shared.model.generative_model import CCN
+from saccade.training.ccn import Pair
+from saccade.training.frames import FrameBatch
 
 
 def _save(path: Path, rows: list[Tensor]) -> None:

@@ -14,16 +14,15 @@ import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from services.perception.paper import CROP_SIDE_M
-from services.simulator.objects import load_mesh
-from services.simulator.views import crop_side_m
-from shared.config import REPOSITORY
-from shared.errors import SaccadeError
-from shared.weights import ObjectCard, write_weights
-from training.checkpoints import ccn_of, finished
-from training.dataset import render_missing
-from training.part import pick_device
-from training.settings import EXTRACTION, TrainingConfig, load_settings
+from saccade.services.perception.paper import CROP_SIDE_M
+from saccade.services.simulator.objects import load_mesh
+from saccade.services.simulator.views import crop_side_m
+from saccade.shared.errors import SaccadeError
+from saccade.shared.model.weights import ObjectCard, write_weights
+from saccade.training.checkpoints import ccn_of, finished
+from saccade.training.dataset import render_missing
+from saccade.training.part import pick_device
+from saccade.training.settings import EXTRACTION, TrainingConfig, load_settings
 
 
 def start(run_dir: Path, config: TrainingConfig) -> TrainingConfig:
@@ -64,8 +63,8 @@ def _train_parts(run_dir: Path, config: TrainingConfig, jobs: int, show) -> None
                 if not ready:
                     break
                 waiting.remove(part := ready[0])
-                command = [sys.executable, "-m", "training.part", str(run_dir), part]
-                running[part] = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=REPOSITORY,
+                command = [sys.executable, "-m", "saccade.training.part", str(run_dir), part]
+                running[part] = subprocess.Popen(command, stderr=subprocess.PIPE, text=True,
                                                  env={"OMP_NUM_THREADS": "1", **os.environ})
             time.sleep(0.5)
             for part, process in list(running.items()):

@@ -7,9 +7,9 @@ from typing import Any, Literal
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
-from shared.config import Section, checked
-from shared.errors import SaccadeError
-from shared.weights import Architecture
+from saccade.shared.config import Section, checked
+from saccade.shared.errors import SaccadeError
+from saccade.shared.model.weights import Architecture
 
 EXTRACTION = "extraction"
 # What holds for the paper's networks unless told otherwise: its batches and rates (appendix C), but fewer steps: its

@@ -9,15 +9,15 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from services.perception.networks import Extraction, Identity
-from services.simulator.views import ObjectViews
-from shared.generative_model import CCN
-from training.ccn import LAMBDA_EVERY, adapt, goal_search_errors, identity_loss, loss_l1, sample_pair
-from training.crops import CropComposer
-from training.extraction import extraction_errors, loss_l2
-from training.frames import FrameComposer
-from training.pictures import draw_ccn, draw_extraction
-from training.settings import TrainingConfig
+from saccade.services.perception.networks import Extraction, Identity
+from saccade.services.simulator.views import ObjectViews
+from saccade.shared.model.generative_model import CCN
+from saccade.training.ccn import LAMBDA_EVERY, adapt, goal_search_errors, identity_loss, loss_l1, sample_pair
+from saccade.training.crops import CropComposer
+from saccade.training.extraction import extraction_errors, loss_l2
+from saccade.training.frames import FrameComposer
+from saccade.training.pictures import draw_ccn, draw_extraction
+from saccade.training.settings import TrainingConfig
 
 IDENTITY_WEIGHT = 50.0
 

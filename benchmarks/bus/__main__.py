@@ -1,4 +1,4 @@
-"""`python -m benchmarks.bus [out.json]`: from process to process, a 480x480 camera image as our encoded Frame.
+"""`python -m saccade.benchmarks.bus [out.json]`: from process to process, a 480x480 camera image as our encoded Frame.
 
 Every contender gets the same bytes at the same pace, in turn, round after round in fresh processes: p50 and p99 of the
 one-way latency, and p50 as a ratio to a plain copy of these bytes and to our bus. `pip install saccade[bench]` installs
@@ -25,11 +25,11 @@ from rich.markup import escape
 from rich.progress import track
 from rich.table import Table
 
-from benchmarks.bus.contenders import CONTENDERS, OURS
-from benchmarks.bus.measure import CODED, ENCODED, KINDS, Plan, frames, within_one_process
-from benchmarks.bus.peer import Contender, run_round
-from shared.errors import SaccadeError
-from shared.wire import encode
+from saccade.benchmarks.bus.contenders import CONTENDERS, OURS
+from saccade.benchmarks.bus.measure import CODED, ENCODED, KINDS, Plan, frames, within_one_process
+from saccade.benchmarks.bus.peer import Contender, run_round
+from saccade.shared.bus.wire import encode
+from saccade.shared.errors import SaccadeError
 
 YARDSTICKS = {ENCODED: "memory copy", CODED: "no bus"}
 NOT_INSTALLED = "not installed: pip install saccade[bench]"

@@ -1,11 +1,17 @@
-"""Who runs. Names are those of the results."""
+"""Who runs. Names are those of the results.
+
+    python -m saccade.benchmarks.bus.contenders CONTENDER ROLE FOLDER ADDRESS: one end of one of them.
+"""
 
 from __future__ import annotations
 
-from benchmarks.bus.dora_rs import DoraRs
-from benchmarks.bus.ours import Ours
-from benchmarks.bus.peer import Contender
-from benchmarks.bus.pyzmq import PyZmq
+import sys
+from pathlib import Path
+
+from saccade.benchmarks.bus.dora_rs import DoraRs
+from saccade.benchmarks.bus.ours import Ours
+from saccade.benchmarks.bus.peer import Contender, serve
+from saccade.benchmarks.bus.pyzmq import PyZmq
 
 OURS = "saccade"
 CONTENDERS: dict[str, Contender] = {contender.name: contender for contender in (
@@ -16,3 +22,6 @@ CONTENDERS: dict[str, Contender] = {contender.name: contender for contender in (
     DoraRs("dora-rs", in_place=False),
     DoraRs("dora-rs, in place", in_place=True),
 )}
+
+if __name__ == "__main__":
+    serve(CONTENDERS[sys.argv[1]], sys.argv[2], Path(sys.argv[3]), sys.argv[4])

@@ -9,8 +9,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from benchmarks.bus.measure import Plan, Receive, Send
-from benchmarks.bus.peer import RECEIVER, ROLES, SENDER, command, run_all
+from saccade.benchmarks.bus.measure import Plan, Receive, Send
+from saccade.benchmarks.bus.peer import RECEIVER, ROLES, SENDER, command, run_all
 
 OUTPUT = "frame"
 QUEUE_SIZE = 1000  # beyond it dora drops

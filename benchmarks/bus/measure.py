@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from shared.errors import SaccadeError
-from shared.geometry import IMAGE_SIZE_PX
-from shared.messages import Frame
-from shared.wire import decode, encode
+from saccade.shared.bus.messages import Frame
+from saccade.shared.bus.wire import decode, encode
+from saccade.shared.errors import SaccadeError
+from saccade.shared.world.geometry import IMAGE_SIZE_PX
 
 ENCODED, CODED = KINDS = ("bytes", "encode + decode")  # from wire bytes to a buffer of them; from Frame to Frame
 RING = 8  # different images, so that no message finds its bytes in a cache because the last one was the same

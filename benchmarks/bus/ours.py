@@ -8,13 +8,13 @@ from contextlib import closing, contextmanager, nullcontext
 from pathlib import Path
 from unittest.mock import patch
 
-from benchmarks.bus.measure import Plan, Receive, Send, frames
-from benchmarks.bus.peer import run_pair
-from shared.bus import ZenohBus, free_endpoint
-from shared.config import Config
-from shared.outbox import Outbox
-from shared.process import Inbox
-from shared.topics import FRAME
+from saccade.benchmarks.bus.measure import Plan, Receive, Send, frames
+from saccade.benchmarks.bus.peer import run_pair
+from saccade.shared.bus.outbox import Outbox
+from saccade.shared.bus.topics import FRAME
+from saccade.shared.bus.transport import ZenohBus, free_endpoint
+from saccade.shared.config import Config
+from saccade.shared.loop.process import Inbox
 
 WORLD = "bench"
 CONFIG = "config.json"
@@ -33,7 +33,7 @@ class Ours:
         """The router is the one of every run."""
         endpoint = free_endpoint("tcp/127.0.0.1:0")
         Config().with_values({"bus.endpoint": endpoint, "bus.world": WORLD}).save(folder / CONFIG)
-        router = [sys.executable, "-m", "services.router", "--config", str(folder / CONFIG)]
+        router = [sys.executable, "-m", "saccade.services.router", "--config", str(folder / CONFIG)]
         run_pair(self, plan, folder, endpoint, beside=router)
 
     @contextmanager

@@ -1,4 +1,4 @@
-"""`python -m benchmarks.bus.peer CONTENDER ROLE FOLDER ADDRESS`: one end of a contender, a process of its own.
+"""One end of a contender, a process of its own: `python -m saccade.benchmarks.bus.contenders` starts it.
 
 FOLDER/round.json says what to do; FOLDER/<role>.npy gets the times.
 """
@@ -21,9 +21,8 @@ from typing import Protocol
 
 import numpy as np
 
-from benchmarks.bus.measure import Plan, Receive, Send, receive_all, send_all
-from shared.config import REPOSITORY
-from shared.errors import SaccadeError
+from saccade.benchmarks.bus.measure import Plan, Receive, Send, receive_all, send_all
+from saccade.shared.errors import SaccadeError
 
 SENDER, RECEIVER = ROLES = ("sender", "receiver")
 ROUND = "round.json"
@@ -50,7 +49,7 @@ class Contender(Protocol):
 
 def command(name: str, role: str, folder: Path, address: str) -> list[str]:
     """The command line of one end."""
-    return [sys.executable, "-m", "benchmarks.bus.peer", name, role, str(folder), address]
+    return [sys.executable, "-m", "saccade.benchmarks.bus.contenders", name, role, str(folder), address]
 
 
 def run_pair(contender: Contender, plan: Plan, folder: Path, address: str, beside: Sequence[str] = ()) -> None:
@@ -61,13 +60,12 @@ def run_pair(contender: Contender, plan: Plan, folder: Path, address: str, besid
 def run_all(commands: Sequence[Sequence[str]], plan: Plan, folder: Path, beside: Sequence[str] = ()) -> None:
     """Runs the commands side by side to their end, and for as long the command `beside`, if any. Raises SaccadeError
     with the last line said if one fails."""
-    path = os.pathsep.join(filter(None, (str(REPOSITORY), os.environ.get("PYTHONPATH"))))
     children: list[subprocess.Popen] = []
     with (folder / LOG).open("ab") as log:
         try:
             for line in (*([beside] if beside else ()), *commands):
                 children.append(subprocess.Popen(line, stdin=subprocess.DEVNULL, stdout=log, stderr=log, cwd=folder,
-                                                 env={**os.environ, "PYTHONPATH": path}, start_new_session=True))
+                                                 start_new_session=True))
             _wait(children[-len(commands):], plan, folder)
             if beside:
                 children[0].terminate()
@@ -108,14 +106,11 @@ def run_round(contender: Contender, plan: Plan, kind: str) -> np.ndarray:
         return np.load(_times(folder, RECEIVER)) - np.load(_times(folder, SENDER))
 
 
-def main(name: str, role: str, folder: Path, address: str) -> None:
+def serve(contender: Contender, role: str, folder: Path, address: str) -> None:
     """One end, from connecting to closing; the sender stays until the receiver has everything."""
-    from benchmarks.bus.contenders import CONTENDERS
-
     told = json.loads((folder / ROUND).read_text())
     plan, kind = Plan(**told["plan"]), told["kind"]
     signal.alarm(int(plan.limit_s))  # ends the process also where a library started it and lost it
-    contender = CONTENDERS[name]
     if role == SENDER:
         with contender.sender(address) as send:
             _save(send_all(plan, kind, send, folder), folder, role)
@@ -134,7 +129,3 @@ def _save(times: np.ndarray, folder: Path, role: str) -> None:
     unfinished = folder / f"{role}.unfinished.npy"
     np.save(unfinished, times)
     unfinished.rename(_times(folder, role))
-
-
-if __name__ == "__main__":
-    main(sys.argv[1], sys.argv[2], Path(sys.argv[3]), sys.argv[4])

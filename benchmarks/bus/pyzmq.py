@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from benchmarks.bus.measure import Plan, Receive, Send
-from benchmarks.bus.peer import run_pair
-from shared.bus import free_endpoint
+from saccade.benchmarks.bus.measure import Plan, Receive, Send
+from saccade.benchmarks.bus.peer import run_pair
+from saccade.shared.bus.transport import free_endpoint
 
 
 class PyZmq:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-from deploy.registry import AGENTS, WORLDS, service_of
-from services.viewer import SHOWN
-from shared.service import Service
-from shared.topics import BELIEF, PLAN, RESULT, ROOT, STATUS, TRUTH, Topic
+from saccade.app.run.registry import AGENTS, WORLDS, service_of
+from saccade.services.viewer import SHOWN
+from saccade.shared.bus.topics import BELIEF, PLAN, RESULT, ROOT, STATUS, TRUTH, Topic
+from saccade.shared.loop.service import Service
 
 SAID = ["put", "reply"]  # by whoever publishes a topic
 ASKED = ["query"]  # by whoever reads it

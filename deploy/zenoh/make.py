@@ -1,4 +1,4 @@
-"""`python -m deploy.zenoh.make FOLDER --host NAME`: all that a bus over several hosts needs, in a new folder.
+"""`python -m saccade.deploy.zenoh.make FOLDER --host NAME`: all that a bus over several hosts needs, in a new folder.
 
 For the router `router.json5`, its certificate and the passwords; for each service `<service>.json5`, its certificate
 and key; an authority of their own. Copy to each host what is its own, and set ZENOH_CONFIG to the .json5.
@@ -14,9 +14,9 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from deploy.zenoh.access import access_control, users
-from shared.errors import SaccadeError
-from shared.process import EXIT_ERROR
+from saccade.deploy.zenoh.access import access_control, users
+from saccade.shared.errors import SaccadeError
+from saccade.shared.loop.process import EXIT_ERROR
 
 DAYS = 825
 AUTHORITY, ROUTER = "authority", "router"
@@ -80,7 +80,7 @@ def _openssl(*arguments: str | Path) -> None:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Exit code 2, with one line, where it cannot."""
-    parser = argparse.ArgumentParser(prog="python -m deploy.zenoh.make", description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(prog="python -m saccade.deploy.zenoh.make", description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--host", action="append", required=True, help="name or address of the router; may be repeated")
     parser.add_argument("--where", type=Path, help="the folder in which they will be, if another")

@@ -1,7 +1,7 @@
-"""`python -m services.belief --config FILE`: percepts in, beliefs out."""
+"""`python -m saccade.services.belief --config FILE`: percepts in, beliefs out."""
 
-from services.belief.core import SERVICE, build
-from shared.loop import main
+from saccade.services.belief.core import SERVICE, build
+from saccade.shared.loop.main import main
 
 if __name__ == "__main__":
     main(SERVICE, build)

@@ -7,23 +7,23 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from services.belief.free_energy import crop_term, identity_term, likelihood_term, pose_term, position_term
-from services.belief.pose import GoalView
-from services.belief.position import PositionFilter, evidence_of
-from shared.config import Config
-from shared.latent import LatentTransition
-from shared.messages import Belief, Percept
-from shared.seeding import generator
-from shared.service import Inputs, Output, Service
-from shared.topics import BELIEF, GOAL_PERCEPT, PERCEPT
-from shared.weights import Weights
+from saccade.services.belief.free_energy import crop_term, identity_term, likelihood_term, pose_term, position_term
+from saccade.services.belief.pose import GoalView
+from saccade.services.belief.position import PositionFilter, evidence_of
+from saccade.shared.bus.messages import Belief, Percept
+from saccade.shared.bus.topics import BELIEF, GOAL_PERCEPT, PERCEPT, Output
+from saccade.shared.config import Config
+from saccade.shared.loop.seeding import generator
+from saccade.shared.loop.service import Inputs, Service
+from saccade.shared.model.latent import LatentTransition
+from saccade.shared.model.weights import Weights
 
 SERVICE = Service("belief", inputs=(PERCEPT, GOAL_PERCEPT), trigger=PERCEPT, outputs=(BELIEF,))
 
 Moments = tuple[NDArray[np.float64], NDArray[np.float64]]  # mean [3], covariance [3, 3]
 
-WORTH_COMPARING = 0.05  # goal presence below which an object's pose is not compared with the goal
-LOCALISED_M = 0.08  # deviation below which a view's displacement means something
+WORTH_COMPARING = 0.05  # chosen: goal presence below which an object's pose is not compared with the goal
+LOCALISED_M = 0.08  # chosen: deviation below which a view's displacement around the object means something
 
 
 class BeliefFilter:

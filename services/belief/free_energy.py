@@ -9,9 +9,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.geometry import project, spherical, wrap
-from shared.latent import LatentTransition, kl_divergence
-from shared.messages import Percept
+from saccade.shared.bus.messages import Percept
+from saccade.shared.model.latent import LatentTransition, kl_divergence
+from saccade.shared.world.geometry import project, spherical, wrap
 
 Array = NDArray[np.float64]
 

@@ -12,8 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.config import BeliefConfig
-from shared.geometry import (
+from saccade.shared.bus.messages import Percept
+from saccade.shared.config import BeliefConfig
+from saccade.shared.model.latent import LatentTransition, log_density
+from saccade.shared.world.geometry import (
     GRID_AZIMUTHS,
     GRID_ELEVATIONS,
     REFERENCE_RANGE_M,
@@ -23,18 +25,19 @@ from shared.geometry import (
     viewing_grid,
     wrap,
 )
-from shared.latent import LatentTransition, log_density
-from shared.messages import Percept
 
 Array = NDArray[np.float64]
 
-OUTLIER = 0.05  # share of views whose latent says nothing
-NEW_VIEW_RAD = 0.08  # a view this near to a kept one adds nothing
-HERE_RAD, TURNED_RAD = 0.25, 0.5  # directions and turns of the image that would pass for the goal's
-NEAR_RAD = 0.35  # views this near to the goal's direction say more about it
-NEAR_WEIGHT = 5.0  # by so much, at most
-SAME_SCALE = 0.3  # weight of the prior that the goal's range is as measured, against one near view
-MOVED_M = 0.01  # when the object is believed elsewhere by this much, the displacements are measured again
+OUTLIER = 0.05  # chosen: share of views whose latent says nothing
+NEW_VIEW_RAD = 0.08  # chosen: a view this near to a kept one adds nothing, a little more than a cell of the grid
+BETTER = 1.2  # chosen: unless its quality is higher by this factor
+CERTAIN = 0.03  # chosen: deviation of a log scale that counts as certain, in the quality of a view
+HERE_RAD = 0.25  # chosen: directions that would pass for the goal's, half of what the task allows
+TURNED_RAD = 0.5  # derived: the task's tolerance, for the turn of the image near the pole
+NEAR_RAD = 0.35  # chosen: views this near to the goal's direction say more about it
+NEAR_WEIGHT = 5.0  # chosen: by so much, at most
+SAME_SCALE = 0.3  # chosen: weight of the prior that the goal's range is as measured, against one near view
+MOVED_M = 0.01  # chosen: when the object is believed elsewhere by this much, displacements are measured again
 
 
 @dataclass(eq=False)
@@ -71,9 +74,9 @@ class GoalView:
         if self.config.pose == "last":
             self.keyframes = []
         eye = percept.world_from_camera[:3, 3]
-        quality = percept.presence / (0.03 + percept.log_scale_std)
+        quality = percept.presence / (CERTAIN + percept.log_scale_std)
         near = [k for k in self.keyframes if _angle(k.eye, eye, self.center) < NEW_VIEW_RAD]
-        if near and max(k.quality for k in near) * 1.2 > quality:
+        if near and max(k.quality for k in near) * BETTER > quality:
             return
         self.keyframes = [k for k in self.keyframes if all(k is not other for other in near)]
         if len(self.keyframes) >= self.config.keyframes:

@@ -10,21 +10,23 @@ import numpy as np
 from filterpy.monte_carlo import systematic_resample
 from numpy.typing import NDArray
 
-from shared.config import BeliefConfig
-from shared.geometry import IMAGE_SIZE_PX, REFERENCE_RANGE_M, pixel_rays, project
-from shared.messages import Percept
+from saccade.shared.bus.messages import Percept
+from saccade.shared.config import BeliefConfig
+from saccade.shared.world.geometry import IMAGE_SIZE_PX, REFERENCE_RANGE_M, pixel_rays, project
 
 Array = NDArray[np.float64]
 
 WORKSPACE_M = np.array([[-0.5, 0.5], [-0.5, 0.5], [0.0, 0.5]])
 VOLUME_M3 = float(np.prod(WORKSPACE_M[:, 1] - WORKSPACE_M[:, 0]))
-MODEL_STD_M = 0.006  # what no network can know: the box's centre against what is seen of it
+MODEL_STD_M = 0.006  # chosen: what no network can know, the box's centre against what is seen of it
 PAPER_ACROSS_M2, PAPER_ALONG_M2 = 0.020, 0.0969  # appendix D, as the published code has them
-CORRELATION = 2.0  # successive views err alike: their deviations count this much larger
-OUTLIER = 0.05  # share of percepts that are of something else, anywhere in the workspace
-FRESH_SHARE = 0.05  # of the particles are drawn anew from each percept, at least
-BORN_VAGUE, VAGUE_M = 0.7, 0.12  # a cloud wider than this says next to nothing: most are drawn anew
-MARGIN_PX = 30  # an object this near to the image's border need not be seen
+CORRELATION = 2.0  # chosen: successive views err alike, so their deviations count this much larger
+OUTLIER = 0.05  # chosen: share of percepts that are of something else, anywhere in the workspace
+FRESH_SHARE = 0.05  # chosen: share of the particles that are drawn anew from each percept, at least
+VAGUE_M = 0.12  # chosen: a cloud wider than this says next to nothing
+BORN_VAGUE = 0.7  # chosen: share of such a cloud that is drawn anew
+MARGIN_PX = 30  # chosen: an object this near to the image's border need not be seen
+MOST_LOG_ODDS = 8.0  # chosen: of presence and absence, so that a belief can still be changed by some views
 
 
 @dataclass(frozen=True)
@@ -95,7 +97,7 @@ class PositionFilter:
         likelihood[fresh] = np.where(inside, born / VOLUME_M3 / max(len(fresh), 1), 0.0)
         self._reweigh(likelihood, rng)
         odds = percept.presence / max(1.0 - percept.presence, 1e-3)
-        self.log_odds = min(self.log_odds + np.log(max(odds, 1e-3)), 8.0)
+        self.log_odds = min(self.log_odds + np.log(max(odds, 1e-3)), MOST_LOG_ODDS)
 
     def visible(self, camera: Array, intrinsics_px: Array, others: list[tuple[Evidence, float]]) -> NDArray[np.bool_]:
         """Which particles [N] are in view and not behind one of the `others` that are seen (with their radii, m)."""
@@ -110,7 +112,8 @@ class PositionFilter:
         """Negative evidence: the object is not seen, so the particles that are `visible` [N] lose."""
         share = float(self.weights[visible].sum())
         self._reweigh(np.where(visible, self.config.missed_weight, 1.0), rng)
-        self.log_odds = max(self.log_odds + np.log(max(1.0 - share * (1.0 - self.config.missed_weight), 1e-3)), -8.0)
+        unseen = max(1.0 - share * (1.0 - self.config.missed_weight), 1e-3)
+        self.log_odds = max(self.log_odds + np.log(unseen), -MOST_LOG_ODDS)
 
     def _reweigh(self, factors: Array, rng: np.random.Generator) -> None:
         weights = self.weights * factors

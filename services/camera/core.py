@@ -7,17 +7,17 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from services.camera.poses import Poses, read_poses
-from services.camera.sources import Source, SourceImage, open_source
-from services.camera.virtual_camera import VirtualCamera
-from shared.config import Config
-from shared.errors import SaccadeError
-from shared.geometry import IMAGE_SIZE_PX, INTRINSICS_PX
-from shared.images import image_size, read_goal_image, read_image
-from shared.messages import Frame, Goal
-from shared.service import Inputs, Output, Service
-from shared.task import start_pose
-from shared.topics import ACTION, FRAME, GOAL
+from saccade.services.camera.poses import Poses, read_poses
+from saccade.services.camera.sources import Source, SourceImage, open_source
+from saccade.services.camera.virtual_camera import VirtualCamera
+from saccade.shared.bus.messages import Frame, Goal
+from saccade.shared.bus.topics import ACTION, FRAME, GOAL, Output
+from saccade.shared.config import Config
+from saccade.shared.errors import SaccadeError
+from saccade.shared.loop.service import Inputs, Service
+from saccade.shared.world.geometry import IMAGE_SIZE_PX, INTRINSICS_PX
+from saccade.shared.world.images import image_size, read_goal_image, read_image
+from saccade.shared.world.task import start_pose
 
 SERVICE = Service("camera", inputs=(ACTION,), trigger=ACTION, outputs=(FRAME, GOAL))
 WHOLE = 0.995  # of the field of view; what is less is said

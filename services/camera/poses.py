@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation, Slerp
 
-from services.camera.sources import SourceImage
-from shared.errors import SaccadeError
-from shared.geometry import Array, pose
+from saccade.services.camera.sources import SourceImage
+from saccade.shared.errors import SaccadeError
+from saccade.shared.world.geometry import Array, pose
 
 Convention = Literal["opengl", "opencv"]  # looks along -z with +y up, or along +z with +y down
 Key = tuple[str, str | int | float | None]  # what is told of a pose, and its value

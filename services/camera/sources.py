@@ -17,8 +17,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.errors import SaccadeError
-from shared.images import Size, image_size, read_image
+from saccade.shared.errors import SaccadeError
+from saccade.shared.world.images import Size, image_size, read_image
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 DEFAULT_RATE_HZ = 10.0

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from shared.errors import SaccadeError
-from shared.geometry import IMAGE_SIZE_PX, INTRINSICS_PX
-from shared.images import Size
+from saccade.shared.errors import SaccadeError
+from saccade.shared.world.geometry import IMAGE_SIZE_PX, INTRINSICS_PX
+from saccade.shared.world.images import Size
 
 Intrinsics = tuple[float, float, float, float]  # fx, fy, cx, cy in pixels
 

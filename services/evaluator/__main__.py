@@ -1,7 +1,7 @@
-"""`python -m services.evaluator`: the evaluator as a process."""
+"""`python -m saccade.services.evaluator`: the evaluator as a process."""
 
-from services.evaluator.core import SERVICE, build
-from shared.loop import main
+from saccade.services.evaluator.core import SERVICE, build
+from saccade.shared.loop.main import main
 
 if __name__ == "__main__":
     main(SERVICE, build)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from shared.config import Config
-from shared.messages import Result, Truth
-from shared.service import Inputs, Output, Service
-from shared.task import errors
-from shared.topics import RESULT, TRUTH
+from saccade.shared.bus.messages import Result, Truth
+from saccade.shared.bus.topics import RESULT, TRUTH, Output
+from saccade.shared.config import Config
+from saccade.shared.loop.service import Inputs, Service
+from saccade.shared.world.task import errors
 
 SERVICE = Service("evaluator", inputs=(TRUTH,), trigger=TRUTH, outputs=(RESULT,))
 

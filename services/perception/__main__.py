@@ -1,7 +1,7 @@
-"""`python -m services.perception --config FILE`: frames and goals in, percepts out."""
+"""`python -m saccade.services.perception --config FILE`: frames and goals in, percepts out."""
 
-from services.perception.core import SERVICE, build
-from shared.loop import main
+from saccade.services.perception.core import SERVICE, build
+from saccade.shared.loop.main import main
 
 if __name__ == "__main__":
     main(SERVICE, build)

@@ -9,17 +9,17 @@ import torch
 import torch.nn.functional as F
 from numpy.typing import ArrayLike, NDArray
 
-from services.perception.cropping import Cropper
-from services.perception.networks import INPUT_PX, Extraction, Identity, tally
-from services.perception.paper import PaperSceneCCN
-from services.perception.seen import Seen, bits
-from shared.config import Config
-from shared.generative_model import Decoder, Encoder, Stacked
-from shared.messages import Frame, Goal, Percept
-from shared.service import Inputs, Output, Service
-from shared.topics import FRAME, GOAL, GOAL_PERCEPT, PERCEPT
-from shared.weights import Weights
-from shared.windows import Window
+from saccade.services.perception.cropping import Cropper
+from saccade.services.perception.networks import INPUT_PX, Extraction, Identity, tally
+from saccade.services.perception.paper import PaperSceneCCN
+from saccade.services.perception.seen import Seen, bits
+from saccade.shared.bus.messages import Frame, Goal, Percept
+from saccade.shared.bus.topics import FRAME, GOAL, GOAL_PERCEPT, PERCEPT, Output
+from saccade.shared.config import Config
+from saccade.shared.loop.service import Inputs, Service
+from saccade.shared.model.generative_model import Decoder, Encoder, Stacked
+from saccade.shared.model.weights import Weights
+from saccade.shared.world.windows import Window
 
 SERVICE = Service("perception", inputs=(FRAME, GOAL), trigger=FRAME, outputs=(PERCEPT, GOAL_PERCEPT),
                   divisible=True)

@@ -8,8 +8,8 @@ import torch.nn.functional as F
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from shared.geometry import pixel_rays
-from shared.windows import CROP_PX, Window, upright
+from saccade.shared.world.geometry import pixel_rays
+from saccade.shared.world.windows import CROP_PX, Window, upright
 
 _FINE_PX = 2 * CROP_PX  # sampled at twice the crop's resolution, then averaged
 _LEVELS = 3  # of the image pyramid: 480, 240, 120

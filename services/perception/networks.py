@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from shared.generative_model import conv_stack
+from saccade.shared.model.generative_model import conv_stack
 
 INPUT_PX = 120  # side of the image that extraction sees
 MASK_PX = 60

@@ -12,11 +12,11 @@ import torch.nn.functional as F
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
-from services.perception.seen import Seen, bits
-from shared.generative_model import Stacked, conv_stack, decoder_of, encoder_of
-from shared.geometry import IMAGE_SIZE_PX, INTRINSICS_PX, REFERENCE_RANGE_M
-from shared.weights import Weights
-from shared.windows import CROP_PX
+from saccade.services.perception.seen import Seen, bits
+from saccade.shared.model.generative_model import Stacked, conv_stack, decoder_of, encoder_of
+from saccade.shared.model.weights import Weights
+from saccade.shared.world.geometry import IMAGE_SIZE_PX, INTRINSICS_PX, REFERENCE_RANGE_M
+from saccade.shared.world.windows import CROP_PX
 
 MASK_PX, WHERE_PX = 64, 32  # sides of what the mask network and the spatial transformer network see
 CANVAS_PX = 120  # images at least this large are cut with several samples per crop pixel

@@ -1,7 +1,7 @@
-"""`python -m services.planner --config FILE`: beliefs in, plans and actions out."""
+"""`python -m saccade.services.planner --config FILE`: beliefs in, plans and actions out."""
 
-from services.planner.core import SERVICE, build
-from shared.loop import main
+from saccade.services.planner.core import SERVICE, build
+from saccade.shared.loop.main import main
 
 if __name__ == "__main__":
     main(SERVICE, build)

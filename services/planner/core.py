@@ -12,11 +12,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from services.planner.free_energy import Terms, expected_free_energy
-from services.planner.goal import aim, infer_preference
-from services.planner.motion import step_towards
-from shared.config import Config
-from shared.geometry import (
+from saccade.services.planner.free_energy import Terms, expected_free_energy
+from saccade.services.planner.goal import aim, infer_preference
+from saccade.services.planner.motion import step_towards
+from saccade.shared.bus.messages import Action, Belief, Plan
+from saccade.shared.bus.topics import ACTION, BELIEF, GOAL_PERCEPT, PLAN, Output
+from saccade.shared.config import Config
+from saccade.shared.loop.seeding import generator
+from saccade.shared.loop.service import Inputs, Service
+from saccade.shared.model.weights import Weights
+from saccade.shared.world.geometry import (
     Array,
     direction,
     look_at,
@@ -26,26 +31,28 @@ from shared.geometry import (
     viewing_grid,
     wrap,
 )
-from shared.messages import Action, Belief, Plan
-from shared.seeding import generator
-from shared.service import Inputs, Output, Service
-from shared.task import LOWER_M, UPPER_M, Spheres, clip, spheres_around, success
-from shared.topics import ACTION, BELIEF, GOAL_PERCEPT, PLAN
-from shared.weights import Weights
+from saccade.shared.world.task import LOWER_M, UPPER_M, Spheres, clip, spheres_around, success
 
 SERVICE = Service("planner", inputs=(BELIEF, GOAL_PERCEPT), trigger=BELIEF, outputs=(PLAN, ACTION))
 
-FOUND_M = 0.06  # deviation of the position below which the target counts as found
-KNOWN_M = 0.10  # objects less certain than this are no obstacle yet
-ARRIVED_M, ARRIVED_RAD = 0.01, 0.05
-STUCK_M = 0.002  # a camera that moves less is as near as it can be
-TURN_M = 0.10  # from here on the camera turns as planned; before, it keeps looking at what it is about
-VISITED_M, VISITED_RAD = 0.05, 0.35  # around a view that turned out not to be the goal's
-VISITED_COST = 6.0  # nats
-DOUBT_LIMIT = 2.5
-SURE = 0.6  # that this is the goal's view, before the agent says so
-PUBLISHED = 64  # candidates that a plan tells of
-PEAK_CELLS = (2, 4)  # the posterior's peak is averaged over so many cells of elevation and azimuth to each side
+FOUND_M = 0.06  # chosen: deviation of the position below which the target counts as found
+KNOWN_M = 0.10  # chosen: objects less certain than this are no obstacle yet
+ARRIVED_M = 0.01  # chosen: the camera has arrived within this distance of its viewpoint
+ARRIVED_RAD = 0.05  # chosen: and within this angle
+STUCK_M = 0.002  # chosen: a camera that moves less than this is as near as it can be
+TURN_M = 0.10  # chosen: from here on the camera turns as planned; before, it keeps looking at what it is about
+NEARER = 0.3  # chosen: nats that a metre of way costs, among search viewpoints that tell the same
+SPREAD_M = 0.10  # from the published code: deviation of the candidates' ranges around the goal's
+CELL_RAD = 0.045  # derived: half a cell of the viewing grid, over which a candidate's direction is spread
+SPREAD = 0.02  # chosen: relative deviation of the range of candidates that are drawn from the goal posterior
+VISITED_M = 0.05  # chosen: how far a view that turned out not to be the goal's speaks for its neighbours
+VISITED_RAD = 0.35  # chosen: the same for their attitude
+VISITED_COST = 6.0  # chosen: nats that such a view costs
+DOUBT_LIMIT = 2.5  # chosen: the goal posterior is softened by no more than this power
+SURE = 0.6  # chosen: probability that this is the goal's view, above which the agent says so
+PEAK_ROWS = 2  # chosen: the posterior's peak is averaged over so many cells of elevation to each side
+PEAK_COLUMNS = 4  # chosen: and over so many cells of azimuth
+PUBLISHED = 64  # candidates that a plan tells of; changes nothing that the agent does
 
 
 class Planner:
@@ -151,7 +158,7 @@ class Planner:
             cost = (terms.pose + terms.scale) / self._doubt + terms.position + terms.information
             cost = cost + self._visited_cost(eyes, target.mean_m)
         else:  # among views that tell the same, the nearest
-            cost = terms.total + 0.3 * np.linalg.norm(eyes - camera[:3, 3], axis=1)
+            cost = terms.total + NEARER * np.linalg.norm(eyes - camera[:3, 3], axis=1)
         chosen = int(np.argmin(cost))
         if known:
             self.viewpoint = best if chosen == len(eyes) - 1 else self._goal_viewpoint(target, eyes[chosen])
@@ -181,7 +188,7 @@ class Planner:
         if self.preference is None:
             return eyes, gazes
         third, doubt = count // 3, self._doubt
-        reach = self.preference.range_m + rng.normal(0, 0.10, third)
+        reach = self.preference.range_m + rng.normal(0, SPREAD_M, third)
         away = unit(eyes[third:2 * third] - gazes[third:2 * third])
         eyes[third:2 * third] = gazes[third:2 * third] + np.maximum(reach, 0.1)[:, None] * away
         if target.goal_log_posterior is not None:
@@ -189,8 +196,8 @@ class Planner:
             cells = rng.choice(len(probabilities), size=third, p=probabilities / probabilities.sum())
             elevation, azimuth = viewing_grid()
             e, a = elevation[cells // len(azimuth)], azimuth[cells % len(azimuth)]
-            away = direction(a + rng.uniform(-0.045, 0.045, third), e + rng.uniform(-0.045, 0.045, third))
-            reach = self.preference.range_m * np.exp(rng.normal(0, 0.02 * doubt, third))
+            away = direction(a + rng.uniform(-CELL_RAD, CELL_RAD, third), e + rng.uniform(-CELL_RAD, CELL_RAD, third))
+            reach = self.preference.range_m * np.exp(rng.normal(0, SPREAD * doubt, third))
             gazes[:third] = target.mean_m
             eyes[:third] = gazes[:third] + reach[:, None] * away
         return eyes, gazes
@@ -211,8 +218,8 @@ class Planner:
         elevation, azimuth = viewing_grid()
         log_posterior = target.goal_log_posterior.astype(np.float64)
         row, column = np.unravel_index(np.argmax(log_posterior), log_posterior.shape)
-        rows = np.arange(max(row - PEAK_CELLS[0], 0), min(row + PEAK_CELLS[0] + 1, len(elevation)))
-        columns = np.arange(column - PEAK_CELLS[1], column + PEAK_CELLS[1] + 1) % len(azimuth)
+        rows = np.arange(max(row - PEAK_ROWS, 0), min(row + PEAK_ROWS + 1, len(elevation)))
+        columns = np.arange(column - PEAK_COLUMNS, column + PEAK_COLUMNS + 1) % len(azimuth)
         mass = np.exp(log_posterior[np.ix_(rows, columns)] - log_posterior[row, column])
         mass /= mass.sum()
         mean_azimuth = azimuth[column] + (mass * wrap(azimuth[columns] - azimuth[column])).sum()

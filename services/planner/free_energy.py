@@ -8,16 +8,29 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.planner.goal import Preference
-from shared.geometry import GRID_AZIMUTHS, GRID_ELEVATIONS, IMAGE_SIZE_PX, INTRINSICS_PX, Array, spherical, unit
-from shared.messages import Belief
+from saccade.services.planner.goal import Preference
+from saccade.shared.bus.messages import Belief
+from saccade.shared.world.geometry import (
+    GRID_AZIMUTHS,
+    GRID_ELEVATIONS,
+    IMAGE_SIZE_PX,
+    INTRINSICS_PX,
+    Array,
+    spherical,
+    unit,
+)
 
-LOCALISED_M = 0.06  # deviation below which an object counts as a point
-ACROSS_STD_M, ALONG_SHARE = 0.012, 0.06  # of one percept, as perception is on average
-FARTHEST_M = 1.2  # beyond it nothing is recognised
-HALF_VIEW_TANGENT = 0.85 * IMAGE_SIZE_PX / 2 / INTRINSICS_PX[0]
-PARTICLES = 160
-DOUBT = 0.1  # an object believed absent is still worth so much of a look
+LOCALISED_M = 0.06  # chosen: deviation below which an object counts as a point
+ACROSS_STD_M = 0.012  # chosen: deviation of one percept across its ray, about what perception has
+ALONG_SHARE = 0.06  # chosen: the same along its ray, as a share of the range
+ALONG_FLOOR_M = 0.01  # chosen: and at least this
+FOUND_STD_M = 0.03  # chosen: deviation of the cloud of an object that was just found
+DETECTED = 0.9  # chosen: probability that an object in view is seen
+FARTHEST_M = 1.2  # chosen: beyond it nothing is recognised
+USED_VIEW = 0.85  # chosen: share of the image's half side within which an object counts as in view
+HALF_VIEW_TANGENT = USED_VIEW * IMAGE_SIZE_PX / 2 / INTRINSICS_PX[0]
+PARTICLES = 160  # chosen: of those published, that the information gain of an object not yet found is measured with
+DOUBT = 0.1  # chosen: an object believed absent is still worth so much of a look
 
 
 @dataclass(frozen=True)
@@ -94,9 +107,9 @@ def information_gain(eyes: Array, look_at: Array, belief: Belief) -> Array:
     for start in range(0, len(eyes), 1000):
         rows = slice(start, start + 1000)
         share[rows] = _in_view(eyes[rows, None], forward[rows, None], particles[None]).mean(1)
-    found = 0.9 * share
+    found = DETECTED * share
     # finding it shrinks the cloud to one percept; not finding it removes the share that was looked at
-    shrink = 0.5 * np.linalg.slogdet(belief.covariance_m2 / np.diag([0.02, 0.02, 0.03]).max() ** 2)[1]
+    shrink = 0.5 * np.linalg.slogdet(belief.covariance_m2 / FOUND_STD_M ** 2)[1]
     return max(belief.presence, DOUBT) * (found * max(shrink, 0.0) - (1 - found) * np.log(np.maximum(1 - found, 1e-3)))
 
 
@@ -114,7 +127,7 @@ def _gaussian_gain(eyes: Array, look_at: Array, mean: Array, covariance: Array) 
     distance = np.linalg.norm(offset, axis=1)
     ray = offset / np.maximum(distance, 1e-9)[:, None]
     outer = ray[:, :, None] * ray[:, None, :]
-    along = 1.0 / (ALONG_SHARE * distance + 0.01) ** 2
+    along = 1.0 / (ALONG_SHARE * distance + ALONG_FLOOR_M) ** 2
     precision = (np.eye(3) - outer) / ACROSS_STD_M ** 2 + outer * along[:, None, None]
     after = np.eye(3) + (covariance + np.eye(3) * 1e-6) @ precision
     seen = _in_view(eyes, unit(look_at - eyes), mean)

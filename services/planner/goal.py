@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from shared.geometry import REFERENCE_RANGE_M, Array, look_at, pixel_rays, pose, unit
-from shared.messages import Percept
+from saccade.shared.bus.messages import Percept
+from saccade.shared.world.geometry import REFERENCE_RANGE_M, Array, look_at, pixel_rays, pose, unit
 
 
 @dataclass(frozen=True)

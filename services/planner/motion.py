@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial.transform import Rotation
 
-from shared.geometry import Array, direction, euler_xyz, fibonacci_hemisphere, unit
-from shared.task import ACTION_LIMIT, LOWER_M, UPPER_M, Spheres, clip
+from saccade.shared.world.geometry import Array, direction, euler_xyz, fibonacci_hemisphere, unit
+from saccade.shared.world.task import ACTION_LIMIT, LOWER_M, UPPER_M, Spheres, clip
 
 STEP_M = 0.05
 _SLACK_M = 1e-6  # a camera that was pushed onto a sphere is outside it

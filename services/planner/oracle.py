@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from services.planner.motion import STEP_M, step_towards
-from shared.config import Config
-from shared.messages import Action, Truth
-from shared.service import Inputs, Output, Service
-from shared.task import Spheres, apply_action, clip, success
-from shared.topics import ACTION, TRUTH
+from saccade.services.planner.motion import STEP_M, step_towards
+from saccade.shared.bus.messages import Action, Truth
+from saccade.shared.bus.topics import ACTION, TRUTH, Output
+from saccade.shared.config import Config
+from saccade.shared.loop.service import Inputs, Service
+from saccade.shared.world.task import Spheres, apply_action, clip, success
 
 SERVICE = Service("oracle", inputs=(TRUTH,), trigger=TRUTH, outputs=(ACTION,))
 

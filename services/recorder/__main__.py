@@ -1,6 +1,6 @@
-"""python -m services.recorder --config FILE: every message of the world into run.mcap beside the configuration."""
+"""python -m saccade.services.recorder --config FILE: every message of the world into run.mcap."""
 
-from services.recorder.core import main
+from saccade.services.recorder.core import main
 
 if __name__ == "__main__":
     main()

@@ -13,21 +13,21 @@ from functools import partial
 from importlib import metadata
 from pathlib import Path
 
-from shared.bus import Bus, ZenohBus
-from shared.config import Config
-from shared.errors import SaccadeError
-from shared.messages import Message
-from shared.outbox import KEPT_BYTES
-from shared.process import Health, Heartbeat, Inbox, Item, run_process
-from shared.provenance import commit
-from shared.reading import RunReader
-from shared.recording import CUT, FLUSH_S, RecordingStopped, RunLog
-from shared.sequences import Key, Sequences
-from shared.topics import RESULT, TOPICS, Topic
-from shared.wire import MessageError, decode
+from saccade.shared.bus.messages import Message
+from saccade.shared.bus.outbox import KEPT_BYTES
+from saccade.shared.bus.sequences import Key, Sequences
+from saccade.shared.bus.topics import RESULT, TOPICS, Topic
+from saccade.shared.bus.transport import Bus, ZenohBus
+from saccade.shared.bus.wire import MessageError, decode
+from saccade.shared.config import Config
+from saccade.shared.errors import SaccadeError
+from saccade.shared.log.folder import LOG_NAME
+from saccade.shared.log.provenance import commit
+from saccade.shared.log.reading import RunReader
+from saccade.shared.log.recording import CUT, FLUSH_S, RecordingStopped, RunLog
+from saccade.shared.loop.process import Health, Heartbeat, Inbox, Item, run_process
 
 NAME = "recorder"
-LOG_NAME = "run.mcap"
 QUEUE_BYTES = 512 * 1024 * 1024
 ASKED_AGAIN_S = 0.5
 QUIET_S = 1.5  # after so long without news the publishers are asked

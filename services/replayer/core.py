@@ -14,10 +14,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
-from shared.errors import SaccadeError
-from shared.reading import Recorded, RunReader
-from shared.topics import Topic
-from shared.wire import MessageError, Stamp, stamp_of
+from saccade.shared.bus.topics import Topic
+from saccade.shared.bus.wire import MessageError, Stamp, stamp_of
+from saccade.shared.errors import SaccadeError
+from saccade.shared.log.reading import Recorded, RunReader
 
 PAUSE, QUIT = " ", "q"
 POLL_S = 0.02

@@ -1,6 +1,6 @@
-"""python -m services.router --config FILE: where the other services meet; a Zenoh router at the bus's endpoint."""
+"""python -m saccade.services.router --config FILE: a Zenoh router, where the other services meet."""
 
-from services.router.core import main
+from saccade.services.router.core import main
 
 if __name__ == "__main__":
     main()

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from shared.bus import ZenohBus
-from shared.config import Config
-from shared.process import Health, Heartbeat, Inbox, run_process
+from saccade.shared.bus.transport import ZenohBus
+from saccade.shared.config import Config
+from saccade.shared.loop.process import Health, Heartbeat, Inbox, run_process
 
 NAME = "router"
 

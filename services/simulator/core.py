@@ -1,4 +1,4 @@
-"""The simulator's core: actions in, frames and the truth out, by the rules of shared/task.py."""
+"""The simulator's core: actions in, frames and the truth out, by the rules of shared/world/task.py."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from services.simulator.objects import load_mesh, names_of
-from services.simulator.scenes import Placed, Scene, Sizes, generate_scene, load_scenes
-from services.simulator.world import World
-from shared.config import Config, SceneConfig
-from shared.errors import SaccadeError
-from shared.images import read_goal_image
-from shared.messages import Frame, Goal, Truth
-from shared.seeding import generator
-from shared.service import Inputs, Output, Service
-from shared.task import MAX_STEPS, Episode, spheres_around
-from shared.topics import ACTION, FRAME, GOAL, RESULT, TRUTH
+from saccade.services.simulator.objects import load_mesh, names_of
+from saccade.services.simulator.scenes import Placed, Scene, Sizes, generate_scene, load_scenes
+from saccade.services.simulator.world import World
+from saccade.shared.bus.messages import Frame, Goal, Truth
+from saccade.shared.bus.topics import ACTION, FRAME, GOAL, RESULT, TRUTH, Output
+from saccade.shared.config import Config, SceneConfig
+from saccade.shared.errors import SaccadeError
+from saccade.shared.loop.seeding import generator
+from saccade.shared.loop.service import Inputs, Service
+from saccade.shared.world.images import read_goal_image
+from saccade.shared.world.task import MAX_STEPS, Episode, spheres_around
 
 SERVICE = Service("simulator", inputs=(ACTION,), trigger=ACTION, outputs=(FRAME, GOAL, TRUTH), closed_by=RESULT)
 

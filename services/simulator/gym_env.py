@@ -1,6 +1,6 @@
 """Active search as a Gymnasium environment, for agents that are trained by reinforcement.
 
-    import gymnasium, services.simulator.gym_env
+    import gymnasium, saccade.services.simulator.gym_env
     env = gymnasium.make("saccade/ActiveSearch-v0", n_objects=3)
 """
 
@@ -15,15 +15,15 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from services.simulator.core import Simulator, names_in_use
-from services.simulator.objects import load_mesh
-from services.simulator.scenes import Scene, generate_scene, load_scenes
-from services.simulator.world import World
-from shared.config import SceneConfig
-from shared.errors import SaccadeError
-from shared.geometry import IMAGE_SIZE_PX
-from shared.messages import Action
-from shared.task import ACTION_LIMIT, MAX_STEPS, errors
+from saccade.services.simulator.core import Simulator, names_in_use
+from saccade.services.simulator.objects import load_mesh
+from saccade.services.simulator.scenes import Scene, generate_scene, load_scenes
+from saccade.services.simulator.world import World
+from saccade.shared.bus.messages import Action
+from saccade.shared.config import SceneConfig
+from saccade.shared.errors import SaccadeError
+from saccade.shared.world.geometry import IMAGE_SIZE_PX
+from saccade.shared.world.task import ACTION_LIMIT, MAX_STEPS, errors
 
 ID = "saccade/ActiveSearch-v0"
 Observation = dict[str, np.ndarray]
@@ -104,4 +104,4 @@ class ActiveSearch(gymnasium.Env[Observation, NDArray[np.float64]]):
         self._world.close()
 
 
-gymnasium.register(ID, entry_point="services.simulator.gym_env:ActiveSearch")
+gymnasium.register(ID, entry_point="saccade.services.simulator.gym_env:ActiveSearch")

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
-from shared.errors import SaccadeError
+from saccade.shared.errors import SaccadeError
 
 TEXTURE_MAX_PX = 2048  # beyond this a texel is far smaller than a pixel of the nearest view
 

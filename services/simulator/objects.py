@@ -8,9 +8,9 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from services.simulator.mesh import Mesh, read_obj
-from services.simulator.pantry import PANTRY_NAMES, make_mesh
-from shared.errors import SaccadeError
+from saccade.services.simulator.mesh import Mesh, read_obj
+from saccade.services.simulator.pantry import PANTRY_NAMES, make_mesh
+from saccade.shared.errors import SaccadeError
 
 YCB_NAMES = ("002_master_chef_can", "003_cracker_box", "004_sugar_box", "005_tomato_soup_can", "006_mustard_bottle")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes.util
 import os
 
-from shared.errors import SaccadeError
+from saccade.shared.errors import SaccadeError
 
 HOW_TO_MEND = ("no OpenGL without a screen: install libosmesa6 (Debian, Ubuntu: `sudo apt-get install libosmesa6`) "
                "or a driver with EGL, or set MUJOCO_GL to the one you have")

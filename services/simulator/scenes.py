@@ -15,9 +15,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from shared.errors import SaccadeError
-from shared.geometry import direction, look_at
-from shared.task import GOAL_CLEARANCE_M, clip, spheres_around
+from saccade.shared.errors import SaccadeError
+from saccade.shared.world.geometry import direction, look_at
+from saccade.shared.world.task import GOAL_CLEARANCE_M, clip, spheres_around
 
 PAPER_SCENES = Path(__file__).parent / "scenes" / "paper_500.json"
 SCENE_KEYS = {"id", "target", "table_rgb", "objects", "goal_world_from_camera"}

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.simulator.mesh import Mesh
-from services.simulator.world import World
-from shared.geometry import REFERENCE_RANGE_M, direction, fibonacci_hemisphere, look_at
+from saccade.services.simulator.mesh import Mesh
+from saccade.services.simulator.world import World
+from saccade.shared.world.geometry import REFERENCE_RANGE_M, direction, fibonacci_hemisphere, look_at
 
 RENDER_PX, TILE_PX = 256, 128
 

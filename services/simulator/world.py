@@ -7,10 +7,10 @@ import weakref
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from services.simulator.mesh import Mesh
-from services.simulator.opengl import HOW_TO_MEND, choose_backend
-from shared.errors import SaccadeError
-from shared.geometry import IMAGE_SIZE_PX, INTRINSICS_PX
+from saccade.services.simulator.mesh import Mesh
+from saccade.services.simulator.opengl import HOW_TO_MEND, choose_backend
+from saccade.shared.errors import SaccadeError
+from saccade.shared.world.geometry import IMAGE_SIZE_PX, INTRINSICS_PX
 
 choose_backend()
 try:

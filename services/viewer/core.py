@@ -11,19 +11,19 @@ from dataclasses import dataclass, field
 
 import rerun as rr
 
-from services.viewer.curves import Curves
-from services.viewer.images import Images
-from services.viewer.imagination import Imagination
-from services.viewer.layout import STEP, Colour, colour_of, layout
-from services.viewer.words import decision, ending
-from services.viewer.world import World
-from shared.config import Config
-from shared.errors import SaccadeError
-from shared.geometry import IMAGE_SIZE_PX
-from shared.messages import Belief, Frame, Message, Percept, Plan, Result, Status, Truth
-from shared.stepper import settle
-from shared.topics import BELIEF, FRAME, GOAL, PERCEPT, PLAN, RESULT, STATUS, TRUTH, Topic
-from shared.weights import Weights
+from saccade.services.viewer.curves import Curves
+from saccade.services.viewer.images import Images
+from saccade.services.viewer.imagination import Imagination
+from saccade.services.viewer.layout import STEP, Colour, colour_of, layout
+from saccade.services.viewer.words import decision, ending
+from saccade.services.viewer.world import World
+from saccade.shared.bus.messages import Belief, Frame, Message, Percept, Plan, Result, Status, Truth
+from saccade.shared.bus.topics import BELIEF, FRAME, GOAL, PERCEPT, PLAN, RESULT, STATUS, TRUTH, Topic
+from saccade.shared.config import Config
+from saccade.shared.errors import SaccadeError
+from saccade.shared.loop.stepper import settle
+from saccade.shared.model.weights import Weights
+from saccade.shared.world.geometry import IMAGE_SIZE_PX
 
 LIVE_PAUSE_S = 0.5  # between drawings of crops while a run goes on: browsers are sent no more than that either
 WAITING = 64  # images that wait for what is perceived in them

@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import rerun as rr
 
-from services.viewer.layout import Colour
-from shared.messages import Belief, Plan, Status, Truth
+from saccade.services.viewer.layout import Colour
+from saccade.shared.bus.messages import Belief, Plan, Status, Truth
 
 F_TERMS: dict[str, Colour] = {"total": (230, 230, 230), "pose": (86, 156, 214), "identity": (78, 201, 176),
                               "crop": (181, 137, 0), "position": (106, 90, 205), "likelihood": (206, 120, 80)}

@@ -6,8 +6,8 @@ import http.client
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from urllib.parse import quote, urlsplit
 
-from shared.config import ViewerConfig
-from shared.errors import SaccadeError
+from saccade.shared.config import ViewerConfig
+from saccade.shared.errors import SaccadeError
 
 ANSWER_S = 20.0
 KEPT = ("Content-Type", "Content-Encoding", "rerun-final-length")  # headers of the page's files

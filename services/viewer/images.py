@@ -8,12 +8,12 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from services.viewer.imagination import Imagination
-from services.viewer.layout import CELL_PX, ROW_PX, Colour
-from services.viewer.words import SEEN, plain
-from services.viewer.world import CAMERA, VIEWPOINT
-from shared.messages import Belief, Frame, Goal, Percept, Plan
-from shared.windows import CROP_PX
+from saccade.services.viewer.imagination import Imagination
+from saccade.services.viewer.layout import CELL_PX, ROW_PX, Colour
+from saccade.services.viewer.words import SEEN, plain
+from saccade.services.viewer.world import CAMERA, VIEWPOINT
+from saccade.shared.bus.messages import Belief, Frame, Goal, Percept, Plan
+from saccade.shared.world.windows import CROP_PX
 
 CAMERA_IMAGE, GOAL_IMAGE, IMAGINED, CROPS = f"{CAMERA}/image", "goal/image", f"{VIEWPOINT}/imagined", "crops/image"
 OF_EPISODE = (CAMERA_IMAGE, GOAL_IMAGE, IMAGINED, CROPS)

@@ -9,13 +9,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from services.viewer.layout import VIEW_PX
-from shared.drawing import LatentDecoder
-from shared.geometry import IMAGE_SIZE_PX, INTRINSICS_PX, REFERENCE_RANGE_M, project, spherical, wrap
-from shared.latent import LatentTransition
-from shared.messages import Belief, Frame, Percept
-from shared.weights import Weights
-from shared.windows import CROP_PX, Window
+from saccade.services.viewer.layout import VIEW_PX
+from saccade.shared.bus.messages import Belief, Frame, Percept
+from saccade.shared.model.drawing import LatentDecoder
+from saccade.shared.model.latent import LatentTransition
+from saccade.shared.model.weights import Weights
+from saccade.shared.world.geometry import IMAGE_SIZE_PX, INTRINSICS_PX, REFERENCE_RANGE_M, project, spherical, wrap
+from saccade.shared.world.windows import CROP_PX, Window
 
 Image = NDArray[np.uint8]
 

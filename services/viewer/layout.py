@@ -5,7 +5,7 @@ from __future__ import annotations
 import rerun.blueprint as rrb
 from rerun.blueprint import Horizontal, Spatial2DView, Spatial3DView, Tabs, TextLogView, TimeSeriesView, Vertical
 
-from shared.geometry import IMAGE_SIZE_PX
+from saccade.shared.world.geometry import IMAGE_SIZE_PX
 
 Colour = tuple[int, int, int]
 

@@ -9,18 +9,18 @@ from pathlib import Path
 
 import rerun as rr
 
-from services.viewer import SHOWN
-from services.viewer.core import Viewer
-from services.viewer.priority import come_last
-from services.viewer.server import Server
-from shared.bus import Bus, ZenohBus
-from shared.config import Config
-from shared.errors import SaccadeError
-from shared.outbox import KEPT_BYTES
-from shared.process import Health, Heartbeat, Inbox, run_process
-from shared.sequences import Sequences
-from shared.topics import STATUS, Topic
-from shared.wire import MessageError, decode
+from saccade.services.viewer import SHOWN
+from saccade.services.viewer.core import Viewer
+from saccade.services.viewer.priority import come_last
+from saccade.services.viewer.server import Server
+from saccade.shared.bus.outbox import KEPT_BYTES
+from saccade.shared.bus.sequences import Sequences
+from saccade.shared.bus.topics import STATUS, Topic
+from saccade.shared.bus.transport import Bus, ZenohBus
+from saccade.shared.bus.wire import MessageError, decode
+from saccade.shared.config import Config
+from saccade.shared.errors import SaccadeError
+from saccade.shared.loop.process import Health, Heartbeat, Inbox, run_process
 
 NAME = "viewer"
 QUEUE_BYTES = 64 * 1024 * 1024  # of messages that wait to be shown; what does not fit is dropped and counted

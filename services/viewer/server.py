@@ -19,10 +19,10 @@ from importlib.util import find_spec
 from pathlib import Path
 from types import TracebackType
 
-from services.viewer.door import open_door
-from services.viewer.priority import session_comes_last
-from shared.config import Config, ViewerConfig
-from shared.errors import SaccadeError
+from saccade.services.viewer.door import open_door
+from saccade.services.viewer.priority import session_comes_last
+from saccade.shared.config import Config, ViewerConfig
+from saccade.shared.errors import SaccadeError
 
 LOOPBACK = "127.0.0.1"
 START_S, STOP_S = 20.0, 5.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from shared.messages import Belief, Plan, Result
+from saccade.shared.bus.messages import Belief, Plan, Result
 
 SEEN = 0.5  # presence from which on an object counts as seen
 NEAR_M = 0.10  # from here on the camera turns as planned

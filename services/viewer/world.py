@@ -9,11 +9,11 @@ import numpy as np
 import rerun as rr
 from numpy.typing import ArrayLike, NDArray
 
-from services.viewer.layout import PATH, PLANNED, TABLE, TRUE, VIEW_PX, Colour, between
-from services.viewer.words import SEEN, plain
-from shared.geometry import IMAGE_SIZE_PX, INTRINSICS_PX
-from shared.messages import Belief, Frame, Plan, Truth
-from shared.task import LOWER_M, UPPER_M
+from saccade.services.viewer.layout import PATH, PLANNED, TABLE, TRUE, VIEW_PX, Colour, between
+from saccade.services.viewer.words import SEEN, plain
+from saccade.shared.bus.messages import Belief, Frame, Plan, Truth
+from saccade.shared.world.geometry import IMAGE_SIZE_PX, INTRINSICS_PX
+from saccade.shared.world.task import LOWER_M, UPPER_M
 
 CAMERA, VIEWPOINT, GOAL, TRUTH = "world/camera", "world/viewpoint", "world/goal", "world/true"
 OF_EPISODE = ("world/objects", "world/path", "world/candidates", VIEWPOINT, GOAL, TRUTH)  # cleared with the next

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from deploy.logs.check import Missing, missing
-from services.viewer.server import LOOPBACK, free_port
-from shared.config import REPOSITORY
+from saccade.app.log.check import Missing, missing
+from saccade.services.viewer.server import LOOPBACK, free_port
+from saccade.shared.config import PACKAGE
 
 USER = 1000 if os.getuid() == 0 else os.getuid()
 BUILD_S, RUN_S = 1800, 300
@@ -84,10 +84,10 @@ class Compose:
 @pytest.fixture(scope="session")
 def clone(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("clone") / "saccade"
-    files = subprocess.run(["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"], cwd=REPOSITORY,
+    files = subprocess.run(["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"], cwd=PACKAGE,
                            capture_output=True, text=True, check=True).stdout.split("\0")
     for name in filter(None, files):
-        if (source := REPOSITORY / name).is_file():
+        if (source := PACKAGE / name).is_file():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(source, folder / name)
     for path in (folder, *folder.rglob("*")):

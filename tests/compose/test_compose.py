@@ -16,15 +16,15 @@ from urllib.parse import parse_qs, urlsplit
 import pytest
 from rerun.chunk import RrdReader
 
-from services.viewer.server import binary
-from shared.bus import ZenohBus
-from shared.config import load
-from shared.reading import RunReader
-from shared.topics import ACTION, PERCEPT, RESULT
-from shared.wire import encode
-from tests.compose.conftest import BUILD_S, USER
-from tests.fakes.camera import LENS_PX, film
-from tests.samples import sample
+from saccade.services.viewer.server import binary
+from saccade.shared.bus.topics import ACTION, PERCEPT, RESULT
+from saccade.shared.bus.transport import ZenohBus
+from saccade.shared.bus.wire import encode
+from saccade.shared.config import load
+from saccade.shared.log.reading import RunReader
+from saccade.tests.compose.conftest import BUILD_S, USER
+from saccade.tests.fakes.camera import LENS_PX, film
+from saccade.tests.samples import sample
 
 SERVICES = ("router", "simulator", "perception", "belief", "planner", "evaluator", "recorder", "viewer")
 EPISODES = 10  # of a run in which something is done meanwhile: some seconds more than that takes

@@ -1,7 +1,7 @@
-"""python -m tests.fakes.belief --config FILE"""
+"""python -m saccade.tests.fakes.belief --config FILE"""
 
-from shared.loop import main
-from tests.fakes.services import SERVICES, build
+from saccade.shared.loop.main import main
+from saccade.tests.fakes.services import SERVICES, build
 
 if __name__ == "__main__":
     main(SERVICES["belief"], lambda config: build("belief", config))

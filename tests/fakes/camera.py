@@ -9,10 +9,10 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from services.simulator.objects import load_mesh, names_of
-from services.simulator.world import World
-from shared.errors import SaccadeError
-from shared.geometry import direction, look_at
+from saccade.services.simulator.objects import load_mesh, names_of
+from saccade.services.simulator.world import World
+from saccade.shared.errors import SaccadeError
+from saccade.shared.world.geometry import direction, look_at
 
 HERE = look_at([0.4, 0.1, 0.3], [0.0, 0.0, 0.05])
 THERE = look_at([0.2, 0.4, 0.5], [0.0, 0.0, 0.05])

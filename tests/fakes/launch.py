@@ -1,4 +1,4 @@
-"""python -m tests.fakes.launch RUN_DIR EPISODES STEPS [WISH]: the fakes between the real router and recorder."""
+"""python -m saccade.tests.fakes.launch RUN_DIR EPISODES STEPS [WISH]: fakes between real router and recorder."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
-from deploy.launch import PROCESSES, launch
-from deploy.supervisor import Process
-from shared.config import Config
-from shared.errors import SaccadeError
+from saccade.app.run.launch import PROCESSES, launch
+from saccade.app.run.supervisor import Process
+from saccade.shared.config import Config
+from saccade.shared.errors import SaccadeError
 
 REAL = ("router", "recorder")
-FAKES = tuple(p if p.name in REAL else Process(p.name, f"tests.fakes.{p.name}") for p in PROCESSES)
+FAKES = tuple(p if p.name in REAL else Process(p.name, f"saccade.tests.fakes.{p.name}") for p in PROCESSES)
 PARTS = ("mug", "can")
 
 

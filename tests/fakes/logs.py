@@ -6,13 +6,13 @@ import math
 
 import numpy as np
 
-from shared.errors import SaccadeError
-from shared.geometry import look_at
-from shared.reading import RunReader
-from shared.recording import RunLog
-from shared.topics import BELIEF, FRAME, GOAL, PERCEPT, PLAN, RESULT, STATUS, TRUTH
-from shared.wire import encode
-from tests.samples import sample
+from saccade.shared.bus.topics import BELIEF, FRAME, GOAL, PERCEPT, PLAN, RESULT, STATUS, TRUTH
+from saccade.shared.bus.wire import encode
+from saccade.shared.errors import SaccadeError
+from saccade.shared.log.reading import RunReader
+from saccade.shared.log.recording import RunLog
+from saccade.shared.world.geometry import look_at
+from saccade.tests.samples import sample
 
 INTRINSICS = np.array([40.0, 41.0, 15.0, 11.0])
 SIZE = 24, 32

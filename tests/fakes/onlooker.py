@@ -1,9 +1,9 @@
-"""python -m tests.fakes.onlooker --config FILE: takes every message and does nothing with it."""
+"""python -m saccade.tests.fakes.onlooker --config FILE: takes every message and does nothing with it."""
 
 from contextlib import closing
 
-from shared.bus import ZenohBus
-from shared.process import Health, Heartbeat, run_process
+from saccade.shared.bus.transport import ZenohBus
+from saccade.shared.loop.process import Health, Heartbeat, run_process
 
 
 def work(config, folder, inbox):

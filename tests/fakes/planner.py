@@ -1,7 +1,7 @@
-"""python -m tests.fakes.planner --config FILE"""
+"""python -m saccade.tests.fakes.planner --config FILE"""
 
-from shared.loop import main
-from tests.fakes.services import SERVICES, build
+from saccade.shared.loop.main import main
+from saccade.tests.fakes.services import SERVICES, build
 
 if __name__ == "__main__":
     main(SERVICES["planner"], lambda config: build("planner", config))

@@ -8,12 +8,12 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from shared.config import Config
-from shared.errors import SaccadeError
-from shared.messages import Action, Belief, Frame, Goal, Percept, Plan, Result, Truth
-from shared.seeding import generator
-from shared.service import Inputs, Output, Service
-from shared.topics import ACTION, BELIEF, FRAME, GOAL, GOAL_PERCEPT, PERCEPT, PLAN, RESULT, TRUTH
+from saccade.shared.bus.messages import Action, Belief, Frame, Goal, Percept, Plan, Result, Truth
+from saccade.shared.bus.topics import ACTION, BELIEF, FRAME, GOAL, GOAL_PERCEPT, PERCEPT, PLAN, RESULT, TRUTH, Output
+from saccade.shared.config import Config
+from saccade.shared.errors import SaccadeError
+from saccade.shared.loop.seeding import generator
+from saccade.shared.loop.service import Inputs, Service
 
 SIDE_PX = 96
 IDENTITY = np.eye(4)

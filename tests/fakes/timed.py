@@ -1,14 +1,14 @@
-"""python -m tests.fakes.timed --config FILE: a camera of noise that goes by time."""
+"""python -m saccade.tests.fakes.timed --config FILE: a camera of noise that goes by time."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from shared.loop import main
-from shared.messages import Frame, Goal
-from shared.service import Output, Service
-from shared.topics import ACTION, FRAME, GOAL
-from tests.fakes.services import IDENTITY, INTRINSICS_PX
+from saccade.shared.bus.messages import Frame, Goal
+from saccade.shared.bus.topics import ACTION, FRAME, GOAL, Output
+from saccade.shared.loop.main import main
+from saccade.shared.loop.service import Service
+from saccade.tests.fakes.services import IDENTITY, INTRINSICS_PX
 
 TIMED = Service("timed", inputs=(ACTION,), trigger=ACTION, outputs=(FRAME, GOAL))
 PIXELS = np.random.default_rng(0).integers(0, 256, (96, 96, 3), dtype=np.uint8)

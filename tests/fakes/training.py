@@ -8,7 +8,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from training.part import Trainer
+from saccade.training.part import Trainer
 
 
 def interrupt_and_resume(run_dir: Path, part: str, *, before_step: int) -> None:

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import torch
 
-from services.perception.networks import Extraction, Identity
-from services.simulator.objects import load_mesh
-from services.simulator.views import crop_side_m
-from shared.generative_model import CCN
-from shared.weights import ObjectCard, write_weights
+from saccade.services.perception.networks import Extraction, Identity
+from saccade.services.simulator.objects import load_mesh
+from saccade.services.simulator.views import crop_side_m
+from saccade.shared.model.generative_model import CCN
+from saccade.shared.model.weights import ObjectCard, write_weights
 
 
 def write_random_weights(folder: Path, object_set: str, names: tuple[str, ...]) -> None:

@@ -1,0 +1,1 @@
+"""Saccade: an active-vision agent made of independent services."""

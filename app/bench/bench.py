@@ -1,0 +1,223 @@
+"""`saccade bench`: an agent on every scene of a file, in processes that share nothing, and what it comes to.
+
+Scene number k of the file is episode k whichever process runs it, so the split over processes changes no result.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from saccade.app.bench import table
+from saccade.app.bench.suites import default_suite, suite_file
+from saccade.app.bench.workers import in_processes
+from saccade.app.provenance import machine, shown
+from saccade.app.run.registry import Pair, local_pairs, weight_hashes
+from saccade.services.simulator.core import names_in_use
+from saccade.services.simulator.scenes import Scene, load_scenes
+from saccade.shared.bus.messages import Result
+from saccade.shared.bus.topics import RESULT
+from saccade.shared.config import Config
+from saccade.shared.errors import SaccadeError
+from saccade.shared.log.provenance import commit
+from saccade.shared.loop.local import run_local
+
+SCENES_ENDING = ".scenes.json"  # of the file with the scenes that were drawn
+RUN = "bench"  # the same in every benchmark: it is in the messages
+MATTERS = ("agent", "objects", "config", "weights", "scenes")  # facts without which results do not belong together
+RECORD_KEYS = ("scene", "target", "objects", "success", "steps", "azimuth_error_rad", "elevation_error_rad",
+               "range_error_m", "declared", "declared_true")
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is to be run: `config` as resolved by `prepare`, the file's scenes and the numbers of those in question.
+
+    `suite` is the name under which the scenes are known, if any.
+    """
+
+    agent: str
+    config: Config
+    scenes: tuple[Scene, ...]
+    chosen: tuple[int, ...]
+    out: Path
+    suite: str | None = None
+
+    @property
+    def partial(self) -> Path:
+        """Where results are kept as they come."""
+        return self.out.with_name(self.out.name + ".partial.jsonl")
+
+
+def prepare(agent: str, config: Config, out: Path, *, suite: str | None = None, limit: int | None = None) -> Plan:
+    """Resolves and checks everything before the first scene runs.
+
+    Without a file: the suite's scenes, kept beside `out` where they are drawn. Raises SaccadeError for both.
+    """
+    if config.scene.file is not None and suite is not None:
+        raise SaccadeError("scenes come from a file or from a suite: leave --scenes or --suite out")
+    names = names_in_use(config.scene)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    path = config.scene.file
+    if path is None:
+        suite = suite or default_suite(config.scene.objects)
+        path = suite_file(suite, config, out.with_name(out.stem + SCENES_ENDING))
+    config = config.with_values({"scene.names": list(names), "scene.file": str(path.resolve()), "bus.kind": "local"})
+    weight_hashes(agent, config)
+    scenes = tuple(load_scenes(path, names))
+    return Plan(agent, config, scenes, spread(scenes, limit), out, suite)
+
+
+def spread(scenes: Sequence[Scene], limit: int | None) -> tuple[int, ...]:
+    """Numbers of at most `limit` scenes, as even over targets and over object counts as can be; always the same."""
+    if limit is None or limit >= len(scenes):
+        return tuple(range(len(scenes)))
+    targets = list(dict.fromkeys(scene.target for scene in scenes))
+    counts = sorted({len(scene.on_table) for scene in scenes})
+    cells: dict[tuple[int, int], list[int]] = {}
+    for number, scene in enumerate(scenes):
+        cells.setdefault((targets.index(scene.target), counts.index(len(scene.on_table))), []).append(number)
+    # along the diagonals of targets x counts, so that any few in a row differ in both
+    side = max(len(targets), len(counts))
+    order = sorted(cells, key=lambda cell: ((cell[1] - cell[0]) % side, cell[0]))
+    rounds = max(len(members) for members in cells.values())
+    numbers = [cells[cell][k] for k in range(rounds) for cell in order if k < len(cells[cell])]
+    return tuple(sorted(numbers[:limit]))
+
+
+def facts(plan: Plan, command: str) -> dict[str, Any]:
+    """Where the results come from: goes into the file, and decides whether a run may be taken up again."""
+    config = plan.config.model_dump(mode="json")
+    file = plan.config.scene.file
+    config["scene"]["file"] = shown(file)
+    if plan.config.perception.weights is not None:
+        config["perception"]["weights"] = shown(plan.config.perception.weights)
+    digest = hashlib.sha256(file.read_bytes()).hexdigest()
+    return {"command": command, "commit": commit(), "agent": plan.agent, "objects": plan.config.scene.objects,
+            "weights": weight_hashes(plan.agent, plan.config), "machine": machine(),
+            "scenes": {"suite": plan.suite, "file": shown(file), "sha256": digest}, "config": config}
+
+
+def bench(plan: Plan, *, jobs: int, command: str, console: Console, cluster: str | None = None) -> list[dict[str, Any]]:
+    """Runs what is not there yet, writes `plan.out`, prints the table; returns the records in the file's order.
+
+    Raises SaccadeError for a scene that cannot be run and for results of another run in the way; what has been reached
+    is kept either way.
+    """
+    origin = facts(plan, command)
+    known = _take_up(plan, origin)
+    wanted = {plan.scenes[number].id: number for number in plan.chosen}
+    done = {scene: record for scene, record in known.items() if scene in wanted}
+    todo = [number for scene, number in wanted.items() if scene not in done]
+    if done:
+        console.print(f"{len(done)} of {len(wanted)} scenes are done already: {plan.partial}")
+    try:
+        with plan.partial.open("a") as partial, _progress(console, len(wanted)) as show:
+            show(list(done.values()))
+            for record in _records(plan, todo, jobs, cluster):
+                partial.write(json.dumps(record) + "\n")
+                partial.flush()
+                done[record["scene"]] = record
+                show(list(done.values()))
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"the same command goes on from the {len(done)} scenes in {plan.partial}") from None
+    records = [done[scene] for scene in wanted]
+    _finish(plan, origin, records)
+    where = f"{plan.config.scene.objects}, {plan.suite or plan.config.scene.file.name}"
+    console.print(table.render(records, title=f"{plan.agent} on {where}, {len(records)} scenes"))
+    console.print(f"written to {plan.out}")
+    return records
+
+
+def _take_up(plan: Plan, origin: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """The records kept by an interrupted run, by scene; appends this run's header."""
+    lines = plan.partial.read_text().split("\n")[:-1] if plan.partial.is_file() else []  # a cut last line is dropped
+    records = {}
+    for line in lines:
+        try:
+            entry = json.loads(line)
+        except ValueError:  # cut by a crash in an earlier round
+            continue
+        if "facts" not in entry:
+            records[entry["scene"]] = entry
+            continue
+        for key in MATTERS:
+            if entry["facts"].get(key) != origin[key]:
+                raise SaccadeError(f"{plan.partial} holds results of another run (its {key} differ): "
+                                   "delete it to start anew, or give another --json")
+    with plan.partial.open("a") as partial:
+        partial.write(("\n" if lines or plan.partial.stat().st_size else "") + json.dumps({"facts": origin}) + "\n")
+    return records
+
+
+def _finish(plan: Plan, origin: dict[str, Any], records: list[dict[str, Any]]) -> None:
+    """Writes the one JSON object; results of an older state of the code say so."""
+    lines = [line for line in plan.partial.read_text().splitlines() if line.startswith('{"facts"')]
+    commits = ", ".join(dict.fromkeys(json.loads(line)["facts"]["commit"] for line in lines))
+    text = json.dumps(origin | {"commit": commits, "results": records}, indent=1)
+    draft = plan.out.with_name(plan.out.name + ".draft")
+    draft.write_text(text + "\n")
+    draft.replace(plan.out)
+    plan.partial.unlink()
+
+
+@contextmanager
+def _progress(console: Console, total: int) -> Iterator:
+    columns = (TextColumn("scenes"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn(),
+               TextColumn("{task.fields[note]}"))
+    with Progress(*columns, console=console) as progress:
+        bar = progress.add_task("scenes", total=total, note="")
+
+        def show(records: list[dict[str, Any]]) -> None:
+            share = 100 * sum(r["success"] for r in records) / len(records) if records else 0.0
+            progress.update(bar, completed=len(records), note=f"success {share:.1f} %")
+
+        yield show
+
+
+def _records(plan: Plan, numbers: Sequence[int], jobs: int, cluster: str | None = None) -> Iterator[dict[str, Any]]:
+    """The records of these scenes as they are ready."""
+    text = plan.config.model_dump_json()
+    work = {plan.scenes[number].id: (plan.agent, text, number) for number in numbers}
+    try:
+        for _, record in in_processes(run_scene, work, jobs, cluster):
+            yield record
+    except SaccadeError as error:
+        raise SaccadeError(f"{error}; the results so far are in {plan.partial}") from error
+
+
+@functools.lru_cache(maxsize=1)
+def cores(agent: str, config_text: str) -> tuple[Config, list[Pair]]:
+    """Meshes, OpenGL and weights are loaded once per process."""
+    config = Config.model_validate_json(config_text)
+    return config, local_pairs(agent, config)
+
+
+def run_scene(agent: str, config_text: str, number: int) -> dict[str, Any]:
+    """The record of one scene, run within this process as episode `number`."""
+    config, pairs = cores(agent, config_text)
+    results: list[Result] = []
+    spent_ms: dict[str, list[float]] = {service.name: [] for service, _ in pairs}
+    start = time.perf_counter()
+    run_local(pairs, config.scene.names, RUN, (number,),
+              lambda topic, part, message, payload: results.append(message) if topic == RESULT else None,
+              on_step=lambda service, milliseconds: spent_ms[service].append(milliseconds))
+    seconds = round(time.perf_counter() - start, 3)
+    means = {service: round(fmean(values), 3) for service, values in spent_ms.items() if values}
+    return record_of(results[0]) | {"seconds": seconds, "milliseconds": means}
+
+
+def record_of(result: Result) -> dict[str, Any]:
+    """What the results file says about an episode, but for its times."""
+    return {key: getattr(result, key) for key in RECORD_KEYS}

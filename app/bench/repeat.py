@@ -1,0 +1,150 @@
+"""Scenes of a results file once more: the same configuration, scenes and seeds give the same episodes, to look at."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from saccade.app.bench.bench import RUN, SCENES_ENDING, cores, record_of
+from saccade.app.bench.suites import SUITES, suite_file
+from saccade.app.look.picture import Story
+from saccade.app.run.registry import weight_hashes
+from saccade.services.simulator.scenes import Scene, load_scenes
+from saccade.shared.bus.messages import Message
+from saccade.shared.bus.topics import Topic
+from saccade.shared.config import PACKAGE, Config, validate
+from saccade.shared.errors import SaccadeError
+from saccade.shared.loop.local import run_local
+
+TOLD_AT_MOST = 2  # settings in a label; where there are more the file's name stands for them
+FACTS = ("agent", "objects", "config", "weights", "scenes", "commit", "machine")
+
+Take = Callable[[Topic, str | None, Message], None]
+
+
+@dataclass(frozen=True)
+class Results:
+    """A file of `saccade bench`. `label` tells it from the others of a report."""
+
+    path: Path
+    facts: dict[str, Any]
+    records: list[dict[str, Any]]
+    label: str = ""
+
+    @property
+    def agent(self) -> str:
+        """The agent's name."""
+        return self.facts["agent"]
+
+    @property
+    def objects(self) -> str:
+        """The object set."""
+        return self.facts["objects"]
+
+    @property
+    def suite(self) -> str:
+        """The name of the scenes: the suite's, else the file's."""
+        return self.facts["scenes"].get("suite") or self.facts["scenes"]["file"]
+
+
+def read_results(path: Path) -> Results:
+    """Raises SaccadeError for a file that is none, or holds no result."""
+    try:
+        tree = json.loads(path.read_text())
+        records, facts = tree["results"], {key: tree[key] for key in FACTS}
+        if not records:
+            raise ValueError("no result is in it")
+    except OSError as error:
+        raise SaccadeError(f"results {path} cannot be read: {error.strerror}") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise SaccadeError(f"results {path} are not of `saccade bench` ({error}): give a file that it has written"
+                           ) from error
+    told = told_otherwise(Config().model_dump(mode="json"), facts["config"])
+    scenes = facts["scenes"].get("suite") or facts["scenes"]["file"]
+    label = ", ".join((facts["agent"], facts["objects"], scenes, *(told if len(told) <= TOLD_AT_MOST else [path.stem])))
+    return Results(path, facts, records, label)
+
+
+def told_otherwise(base: dict[str, Any], other: dict[str, Any]) -> list[str]:
+    """The keys in which a configuration tells the agent or its world something else than another, with their values;
+    which scenes, and over which bus, is not of these."""
+    mine, theirs = (_flat({key: value for key, value in tree.items() if key not in ("scene", "bus", "seed")})
+                    for tree in (base, other))
+    return [f"{key}={theirs[key]}" for key in theirs if key in mine and theirs[key] != mine[key]]
+
+
+def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    result: dict[str, Any] = {}
+    for key, value in tree.items():
+        result |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+    return result
+
+
+@dataclass(frozen=True)
+class Again:
+    """What it takes to run scenes of a results file again."""
+
+    results: Results
+    config: Config
+    scenes: tuple[Scene, ...]
+
+    def arguments(self, scene_id: str) -> tuple[str, str, int]:
+        """What `replay` takes for that scene."""
+        number = next(k for k, scene in enumerate(self.scenes) if scene.id == scene_id)
+        return self.results.agent, self.config.model_dump_json(), number
+
+
+def prepare_again(results: Results, folder: Path, weights: Path | None = None) -> Again:
+    """Finds (or draws into `folder`) the scenes and the weights. Raises SaccadeError where they are not the same."""
+    config = validate(results.facts["config"], str(results.path))
+    folder_of_weights = weights or config.perception.weights
+    if folder_of_weights is not None:
+        path = folder_of_weights if weights is not None else PACKAGE / folder_of_weights
+        config = config.with_values({"perception.weights": str(path.resolve())})
+    file = _scenes_file(results, config, folder)
+    config = config.with_values({"scene.file": str(file.resolve())})
+    if weight_hashes(results.agent, config) != results.facts["weights"]:
+        raise SaccadeError(f"{config.weights} does not hold the weights of {results.path}: give them with --weights")
+    return Again(results, config, tuple(load_scenes(file, config.scene.names)))
+
+
+def _scenes_file(results: Results, config: Config, folder: Path) -> Path:
+    """The file where it was, beside the results or in the present folder; else the suite, drawn once more."""
+    wanted = results.facts["scenes"]
+
+    def candidates() -> Iterator[Path]:
+        yield from (PACKAGE / wanted["file"], results.path.with_name(Path(wanted["file"]).name),
+                    Path(wanted["file"]))
+        if wanted.get("suite") in SUITES:
+            yield suite_file(wanted["suite"], config, folder / f"drawn{SCENES_ENDING}")
+
+    for path in candidates():
+        if path.is_file() and hashlib.sha256(path.read_bytes()).hexdigest() == wanted["sha256"]:
+            return path
+    raise SaccadeError(f"the scenes of {results.path} are not to be found: put {wanted['file']} beside it")
+
+
+def replay(agent: str, config_text: str, number: int, take: Take | None = None) -> Story:
+    """Episode `number` within this process; `take` sees its messages. The last view is the one that was reached."""
+    config, pairs = cores(agent, config_text)
+    story = Story(number)
+
+    def hear(topic: Topic, part: str | None, message: Message, _payload: bytes | None) -> None:
+        story.take(topic, part, message)
+        if take is not None:
+            take(topic, part, message)
+
+    run_local(pairs, config.scene.names, RUN, (number,), hear)
+    simulator = pairs[0][1]  # the last move has no frame
+    story.last_rgb, story.last_step = simulator.world.render(simulator.state.camera), simulator.state.step
+    story.goal_is_known = story.goal_rgb is not None
+    return story
+
+
+def same_as(story: Story, record: dict[str, Any]) -> bool:
+    """Whether an episode ended as the record says."""
+    return all(record[key] == value for key, value in record_of(story.result).items())

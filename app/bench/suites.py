@@ -1,0 +1,91 @@
+"""Suites: the scenes that results are told about, by name. But for the paper's own, all are drawn from seeds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from saccade.services.simulator.core import names_in_use
+from saccade.services.simulator.objects import load_mesh
+from saccade.services.simulator.scenes import (
+    PAPER_SCENES,
+    Scene,
+    Sizes,
+    draw_goal,
+    generate_scene,
+    generate_split,
+    save_scenes,
+)
+from saccade.shared.config import Config
+from saccade.shared.errors import SaccadeError
+
+YAW_SEED, ROOM_SEED = 31_415_000, 27_182_000
+DEV_SEEDS = {"fixed": 57_721_000, "random": 57_722_000}  # of the halves whose objects are not turned, and are
+ROOM_GOALS = 20  # of each target
+DEV_REPEATS = 2  # in each half
+
+
+@dataclass(frozen=True)
+class Suite:
+    """Scenes as `draw(sizes, seed of the run)` makes them; or those of a file, which are of one object set alone."""
+
+    draw: Callable[[Sizes, int], list[Scene]] | None = None
+    file: Path | None = None
+    objects: str | None = None
+
+
+def _split(sizes: Sizes, seed: int, yaw: str, repeats: int = 20) -> list[Scene]:
+    return generate_split(sizes, seed=seed, counts=range(1, len(sizes) + 1), repeats=repeats, yaw=yaw)
+
+
+def _room(sizes: Sizes, _seed: int) -> list[Scene]:
+    """One table with all objects, never turned, and goals by the paper's rule: its comparison with LEXA."""
+    rng, names = np.random.default_rng(ROOM_SEED), tuple(sizes)
+    room = generate_scene(rng, sizes, names[0], len(names), yaw="fixed")
+    present = [placed.name for placed in room.objects]
+    centers, extents = [p.center_m for p in room.objects], [sizes[name] for name in present]
+    return [replace(room, id=f"lexa-{ROOM_GOALS * k + goal}", target=target,
+                    goal_world_from_camera=draw_goal(rng, centers, extents, present.index(target)))
+            for k, target in enumerate(names) for goal in range(ROOM_GOALS)]
+
+
+def _dev(sizes: Sizes, _seed: int) -> list[Scene]:
+    """For tuning: nothing else is."""
+    return [scene for yaw, seed in DEV_SEEDS.items() for scene in _split(sizes, seed, yaw, DEV_REPEATS)]
+
+
+SUITES = {
+    "paper-500": Suite(file=PAPER_SCENES, objects="ycb"),
+    "yaw-500": Suite(lambda sizes, _seed: _split(sizes, YAW_SEED, "random")),
+    "lexa-room": Suite(_room),
+    "dev": Suite(_dev),
+    "paper-like": Suite(lambda sizes, seed: _split(sizes, seed, "fixed")),
+    "paper-like-yaw": Suite(lambda sizes, seed: _split(sizes, seed, "random")),
+}
+
+
+def default_suite(objects: str) -> str:
+    """The paper's scenes for its objects, a split drawn like it for others."""
+    return "paper-500" if objects == SUITES["paper-500"].objects else "paper-like"
+
+
+def suite_file(name: str, config: Config, beside: Path) -> Path:
+    """The file with a suite's scenes: its own, or `beside`, written here.
+
+    Raises SaccadeError for an unknown suite and for one that is not of the configured objects.
+    """
+    if name not in SUITES:
+        raise SaccadeError(f"suite {name!r} is unknown: choose from {', '.join(SUITES)}")
+    suite, scene = SUITES[name], config.scene
+    if suite.objects not in (None, scene.objects):
+        others = ", ".join(other for other, s in SUITES.items() if s.objects is None)
+        raise SaccadeError(f"suite {name!r} is of the objects {suite.objects!r}: add `--objects {suite.objects}`, or "
+                           f"choose from {others}")
+    if suite.file is not None:
+        return suite.file
+    sizes = {each: load_mesh(scene.objects, each).size_m for each in names_in_use(scene)}
+    save_scenes(beside, suite.draw(sizes, config.seed))
+    return beside

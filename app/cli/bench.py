@@ -1,0 +1,73 @@
+"""`saccade bench` and `saccade report`: how well an agent does."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from saccade.app.cli.options import (
+    ConfigFile,
+    Objects,
+    ScenesFile,
+    Seed,
+    Values,
+    WeightsFolder,
+    command_line,
+    configured,
+    wide,
+)
+from saccade.shared.errors import SaccadeError
+
+app = typer.Typer()
+
+
+@app.command()
+def bench(*, objects: Objects = None, scenes: ScenesFile = None,
+          suite: Annotated[str | None, typer.Option(
+              help="paper-500, yaw-500, lexa-room, dev (for tuning) or paper-like",
+              show_default="paper-500 for ycb, paper-like for pantry")] = None,
+          agent: Annotated[str, typer.Option(help="which agent")] = "sceneccn",
+          limit: Annotated[int | None, typer.Option(min=1, help="only so many scenes, evenly chosen")] = None,
+          jobs: Annotated[int, typer.Option(min=1, help="processes at a time")] = 1,
+          cluster: Annotated[str | None, typer.Option(
+              metavar="ADDRESS", help="a Ray cluster in place of --jobs: ray://host:10001")] = None,
+          json: Annotated[Path | None, typer.Option(
+              help="file for the results", show_default="bench/<agent>_<set>[_<suite>].json")] = None,
+          yaw: Annotated[Literal["random", "fixed"] | None, typer.Option(
+              help="the suite paper-like, drawn from --seed, its objects turned or not")] = None,
+          seed: Seed = None, weights: WeightsFolder = None, config: ConfigFile = None, values: Values = None) -> None:
+    """Measure an agent on many scenes; given again after an interruption, go on from there."""
+    from rich.console import Console
+
+    from saccade.app.bench.bench import bench as run_bench
+    from saccade.app.bench.bench import prepare
+
+    resolved = configured(config, {"scene.objects": objects, "scene.file": scenes, "seed": seed,
+                                   "perception.weights": weights}, values)
+    if yaw is not None and (resolved.scene.file is not None or suite is not None):
+        raise SaccadeError("--yaw is for scenes that are drawn: leave it or --scenes and --suite out")
+    if yaw is not None:
+        suite = {"fixed": "paper-like", "random": "paper-like-yaw"}[yaw]
+    name = "_".join(filter(None, (agent, resolved.scene.objects, suite)))
+    plan = prepare(agent, resolved, json or Path("bench") / f"{name}.json", suite=suite, limit=limit)
+    run_bench(plan, jobs=jobs, cluster=cluster, command=command_line(), console=wide(Console()))
+
+
+@app.command()
+def report(*, results: Annotated[list[Path], typer.Argument(
+               metavar="RESULTS.json...", help="files of `saccade bench`")],
+           out: Annotated[Path, typer.Option(help="folder of the report")],
+           failures: Annotated[bool, typer.Option(
+               "--failures", help="also failures.md: every failed scene, run again, by its cause")] = False,
+           no_reruns: Annotated[bool, typer.Option(
+               "--no-reruns", help="only what the results alone tell: no episodes are run again")] = False,
+           weights: WeightsFolder = None,
+           jobs: Annotated[int, typer.Option(min=1, help="processes at a time, for --failures")] = 1) -> None:
+    """Write results as a page with tables and pictures: report.md."""
+    from rich.console import Console
+
+    from saccade.app.bench.report import report as write_report
+
+    write_report(results, out, failures=failures, reruns=not no_reruns, weights=weights, jobs=jobs, console=Console())

@@ -1,0 +1,90 @@
+"""`saccade log <command>`: logs of runs looked at, checked, mended, cut and exported."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from saccade.app.cli.options import wide
+
+EXIT_INCOMPLETE = 1
+
+app = typer.Typer(no_args_is_help=True, help="Look at logs of runs, check, mend, cut and export them.")
+
+Run = Annotated[Path, typer.Argument(metavar="RUN", help="folder of a run, or its log")]
+Out = Annotated[Path, typer.Option(help="the new log, a file")]
+
+
+@app.command()
+def info(run: Run) -> None:
+    """Say where a log comes from and what is in it: episodes, messages, rates, sizes, gaps."""
+    from rich.console import Console
+
+    from saccade.app.log.info import gather, lines
+    from saccade.app.log.source import log_of
+
+    told = gather(log_of(run))
+    for line in lines(told):
+        print(line)
+    wide(Console()).print(told.keys.table(told.reader.world), markup=False)
+
+
+@app.command()
+def check(run: Run) -> None:
+    """Say what a log lacks; exit code 0 if that is nothing, else 1."""
+    from saccade.app.log.check import missing
+    from saccade.app.log.source import log_of
+
+    report = missing(log_of(run))
+    for line in report.lines():
+        print(line)
+    if not report.complete:
+        raise typer.Exit(EXIT_INCOMPLETE)
+    print(f"complete: {report.messages} messages")
+
+
+@app.command()
+def recover(run: Run, out: Out) -> None:
+    """Make a good log of a cut or damaged one, and say what was lost."""
+    from saccade.app.log.check import missing
+    from saccade.app.log.recover import recover as recover_log
+    from saccade.app.log.source import log_of
+
+    report = recover_log(log_of(run), out)
+    lost = [*report.lines(), *missing(out).lines()]
+    print(f"{report.messages} messages written to {out}; " + ("it lacks:" if lost else "nothing is missing"))
+    for line in lost:
+        print(line)
+
+
+@app.command()
+def cut(run: Run, out: Out,
+        episode: Annotated[int | None, typer.Option(min=0, help="which one", show_default="the last")] = None,
+        start: Annotated[int, typer.Option(min=0, help="first step")] = 0,
+        end: Annotated[int | None, typer.Option(min=0, help="last step", show_default="the last")] = None) -> None:
+    """Take some steps of an episode out of a log, as a log of their own."""
+    from saccade.app.log.check import missing
+    from saccade.app.log.cut import cut as cut_log
+    from saccade.app.log.source import log_of
+
+    kept = cut_log(log_of(run), out, episode=episode, start=start, end=end)
+    print(f"{kept} written to {out}")
+    for line in missing(out).lines():
+        print(line)
+
+
+@app.command()
+def export(run: Run,
+           out: Annotated[Path, typer.Option(help="the new file; with --tables the new folder")],
+           tables: Annotated[bool, typer.Option(
+               "--tables", help="Parquet tables, one for each topic, instead of MCAP")] = False) -> None:
+    """Write a log for other tools: MCAP that Foxglove and Rerun show, or tables."""
+    from saccade.app.log.export import export_foxglove, export_tables
+    from saccade.app.log.source import log_of
+
+    if tables:
+        print(f"{len(export_tables(log_of(run), out))} tables written to {out}")
+    else:
+        print(f"{sum(export_foxglove(log_of(run), out).values())} messages written to {out}")

@@ -1,0 +1,48 @@
+"""The front door: `saccade <command>`. Commands load what they need when they are called."""
+
+from __future__ import annotations
+
+import signal
+import sys
+
+import typer
+
+from saccade.app.cli import bench, log, look, replay, run, train
+from saccade.app.run.threads import prefer_one_thread
+from saccade.shared.errors import SaccadeError
+
+EXIT_ERROR, EXIT_INTERRUPTED = 2, 130
+
+app = typer.Typer(name="saccade", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
+                  help="An active-vision agent: it looks, believes and moves until it sees the goal image.")
+for commands in (run, replay, bench, train, look):
+    app.add_typer(commands.app)
+app.add_typer(log.app, name="log")
+
+
+@app.command()
+def doctor() -> None:
+    """Check this machine: what works, what is missing, how to mend it."""
+    from saccade.app.doctor import examine
+
+    raise typer.Exit(examine())
+
+
+def main() -> None:
+    """The console script: what the user can mend is one line and exit code 2, Ctrl-C one line and 130."""
+    prefer_one_thread()
+    try:
+        app()
+    except SaccadeError as error:
+        print(f"saccade: {error}", file=sys.stderr)
+        sys.exit(EXIT_ERROR)
+    except SystemExit as error:
+        if error.code == EXIT_INTERRUPTED:
+            signal.signal(signal.SIGINT, signal.SIG_IGN)  # once more would break into the interpreter's end
+            reason = getattr(error.__context__, "__cause__", None)
+            print(f"saccade: interrupted{f': {reason}' if str(reason or '') else ''}", file=sys.stderr)
+        raise
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,80 @@
+"""`saccade run`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from saccade.app.cli.options import (
+    ConfigFile,
+    Names,
+    Objects,
+    ScenesFile,
+    Seed,
+    Values,
+    WeightsFolder,
+    Yaw,
+    configured,
+    numbers,
+    split_names,
+)
+from saccade.shared.errors import SaccadeError
+
+app = typer.Typer()
+
+
+@app.command()
+def run(*, objects: Objects = None, names: Names = None, scenes: ScenesFile = None,
+        scene: Annotated[str | None, typer.Option(help="id of one scene in the file")] = None, seed: Seed = None,
+        count: Annotated[int | None, typer.Option(min=1, help="how many scenes to draw")] = None,
+        n_objects: Annotated[int | None, typer.Option(min=1, help="objects on the table")] = None, yaw: Yaw = None,
+        goal: Annotated[Path | None, typer.Option(help="goal image, 480x480 PNG or JPEG")] = None,
+        explore: Annotated[bool, typer.Option("--explore", help="no goal: find out what is there")] = False,
+        out: Annotated[Path | None, typer.Option(help="folder of the run", show_default="runs/<time>-<seed>")] = None,
+        bus: Annotated[Literal["zenoh", "local"] | None, typer.Option(
+            help="services as processes on Zenoh, or all within this one", show_default="zenoh")] = None,
+        agent: Annotated[str, typer.Option(help="which agent")] = "sceneccn", weights: WeightsFolder = None,
+        world: Annotated[str, typer.Option(help="simulator, or camera: a real one")] = "simulator",
+        source: Annotated[str | None, typer.Option(
+            help="of a camera's images: a folder, a video file, or a webcam: webcam:0")] = None,
+        poses: Annotated[Path | None, typer.Option(help="where the camera was: JSON lines or TUM")] = None,
+        intrinsics: Annotated[str | None, typer.Option(help="of its images, in pixels", metavar="fx,fy,cx,cy")] = None,
+        rate: Annotated[float | None, typer.Option(
+            help="images a second of a folder or webcam", show_default="10")] = None,
+        loop: Annotated[bool, typer.Option("--loop", help="from the first image again after the last")] = False,
+        config: ConfigFile = None, values: Values = None,
+        view: Annotated[bool, typer.Option("--view", help="show it in a browser, see `saccade view`")] = False,
+        plain: Annotated[bool, typer.Option("--plain", help="lines instead of the live display")] = False) -> None:
+    """Run the agent and log everything: run.mcap, config.json, picture.png."""
+    from rich.console import Console
+
+    from saccade.app.look.picture import draw_run
+    from saccade.app.run.display import say
+    from saccade.app.run.run import Finished
+    from saccade.app.run.run import run as run_agent
+    from saccade.services.viewer.server import url_of
+
+    given = {"scene.objects": objects, "scene.names": split_names(names), "scene.file": scenes, "scene.scene": scene,
+             "seed": seed, "scene.count": count, "scene.n_objects": n_objects, "scene.yaw": yaw,
+             "scene.goal_image": goal, "scene.explore": explore or None, "bus.kind": bus,
+             "perception.weights": weights, "camera.source": source, "camera.poses": poses,
+             "camera.intrinsics_px": numbers(intrinsics), "camera.rate_hz": rate, "camera.loop": loop or None}
+    console = Console()
+
+    def show(finished: Finished) -> None:
+        try:
+            draw_run(finished.folder)
+        except SaccadeError as error:  # that it cannot be drawn does not undo the run
+            print(f"saccade: no picture: {error}", file=sys.stderr)
+        say(console, f"log, configuration and picture are in {finished.folder}")
+        if console.is_terminal and finished.is_viewed():
+            from saccade.app.look.view import stay  # Rerun is loaded where it is wanted
+
+            say(console, f"to be seen at {url_of(finished.config.viewer)} until Ctrl-C")
+            stay(finished.is_viewed)
+
+    run_agent(configured(config, given, values), agent=agent, out=out, plain=plain, console=console, world=world,
+              view=view, after=show)

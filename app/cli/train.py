@@ -1,0 +1,48 @@
+"""`saccade train`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from saccade.app.cli.options import Names, Objects, Seed, WeightsFolder, parse_value, split_names
+
+app = typer.Typer()
+
+
+@app.command()
+def train(*, objects: Objects = None, names: Names = None,
+          out: Annotated[Path | None, typer.Option(
+              help="folder of the training", show_default="training_runs/<set>")] = None,
+          steps_ccn: Annotated[int | None, typer.Option(min=1, help="steps of each object's networks")] = None,
+          steps_extraction: Annotated[int | None, typer.Option(min=1, help="steps of the network for all")] = None,
+          views: Annotated[int | None, typer.Option(min=20, max=5000, help="views of each object")] = None,
+          seed: Seed = None, jobs: Annotated[int, typer.Option(min=1, help="networks at a time")] = 1,
+          device: Annotated[Literal["auto", "cpu", "cuda"] | None, typer.Option(show_default="auto")] = None,
+          architecture: Annotated[Literal["default", "paper"], typer.Option(
+              help="our networks, or those of the paper's tables; theirs go to folders named <set>-paper")] = "default",
+          weights: WeightsFolder = None, values: Annotated[list[str] | None, typer.Option(
+              "--set", metavar="KEY=VALUE", help="any key of training/settings.py, e.g. batch_ccn=64")] = None) -> None:
+    """Train the networks of an object set; given again after an interruption, go on from there."""
+    from rich.console import Console
+
+    from saccade.services.simulator.core import names_in_use
+    from saccade.shared.config import WEIGHTS, SceneConfig
+    from saccade.training.run import export
+    from saccade.training.run import train as run_training
+    from saccade.training.settings import settings_from
+
+    object_set = objects or "pantry"
+    given = {"seed": seed, "steps_ccn": steps_ccn, "steps_extraction": steps_extraction, "views": views,
+             "device": device, "architecture": architecture}
+    chosen = names_in_use(SceneConfig(objects=object_set, names=split_names(names)))
+    settings = settings_from({"objects": object_set, "names": chosen}
+                             | {k: v for k, v in given.items() if v is not None}
+                             | dict(parse_value(text) for text in values or ()))
+    name = object_set if architecture == "default" else f"{object_set}-{architecture}"
+    folder, target = out or Path("training_runs") / name, weights or WEIGHTS / name
+    run_training(folder, settings, jobs=jobs, console=Console())
+    export(folder, target)
+    print(f"weights written to {target}")

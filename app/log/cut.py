@@ -1,0 +1,102 @@
+"""Some steps of an episode out of a log, as a log of their own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from saccade.app.log.source import whole
+from saccade.shared.bus.wire import MessageError, decode
+from saccade.shared.errors import SaccadeError
+from saccade.shared.log.reading import Recorded, RunReader
+from saccade.shared.log.recording import CUT, ENDED_EARLY, LOG, RecordingStopped, RunLog
+
+
+@dataclass(frozen=True)
+class Range:
+    """Steps of an episode (None: of every one), `end` included (None: up to the last)."""
+
+    episode: int | None
+    start: int
+    end: int | None
+
+    def __str__(self) -> str:
+        steps = f"steps {self.start} to {self.end}" if self.end is not None else f"steps from {self.start} on"
+        return steps + (f" of episode {self.episode}" if self.episode is not None else "")
+
+
+def range_of(reader: RunReader) -> Range | None:
+    """Which steps a log was cut to, or recorded from; None for a whole one. Known once its first entry has been read.
+    Raises SaccadeError where the log does not say it."""
+    told = reader.metadata.get(CUT)
+    try:
+        return Range(*(int(told[name]) if name == "start" or name in told else None
+                       for name in ("episode", "start", "end"))) if told else None
+    except (KeyError, ValueError) as error:
+        raise SaccadeError(f"log {reader.path} was cut, but does not say to which steps") from error
+
+
+def cut(log: Path, out: Path, *, episode: int | None = None, start: int = 0, end: int | None = None) -> Range:
+    """Writes the messages of these steps of an episode (the last) into the new log `out`, in today's format, and says
+    which they are. With them go the latched messages up to then, and each service's status of that time.
+
+    Raises SaccadeError if nothing is left, `log` cannot be read, or `out` is there already or cannot be written.
+    """
+    kept, times = _find(log, episode, start, end)
+    reader, target = RunReader(log), None
+    with whole(out) as partial:
+        try:
+            for entry in reader.entries():
+                if target is None:
+                    metadata = {name: told for name, told in reader.metadata.items() if name not in (LOG, ENDED_EARLY)}
+                    metadata[CUT] = {"episode": kept.episode, "start": kept.start, "end": kept.end}
+                    target = RunLog(partial, world=reader.world, configuration=reader.configuration or "{}",
+                                    metadata=metadata)
+                sequence = _kept(entry, kept, times)
+                if sequence is not None:
+                    target.write(entry.topic, entry.part, entry.payload, sequence=sequence,
+                                 log_time_ns=entry.log_time_ns)
+            target.close()
+        except RecordingStopped as error:
+            raise SaccadeError(f"{out} cannot be written: {error.__cause__ or error}") from error
+    return kept
+
+
+def _find(log: Path, episode: int | None, start: int, end: int | None) -> tuple[Range, tuple[int, int]]:
+    """What there is of the steps asked for, and from when to when it was recorded (ns)."""
+    there: dict[int, dict[int, tuple[int, int]]] = {}  # by episode and step: the first and last time
+    reader = RunReader(log)
+    for entry in reader.entries():
+        if entry.topic.in_step and not entry.topic.latched:
+            try:
+                message = decode(entry.topic.type, entry.payload)
+            except MessageError:
+                continue
+            steps, now = there.setdefault(message.episode, {}), entry.log_time_ns
+            first, last = steps.get(message.step, (now, now))
+            steps[message.step] = min(first, now), max(last, now)
+    if not there:
+        raise SaccadeError(f"log {log} holds no steps to cut")
+    episode = max(there) if episode is None else episode
+    if episode not in there:
+        raise SaccadeError(f"log {log} has no episode {episode}: choose from {min(there)} to {max(there)}")
+    steps, before = there[episode], range_of(reader) or Range(episode, 0, 0)
+    chosen = {step: times for step, times in steps.items() if start <= step and (end is None or step <= end)}
+    if not chosen:
+        asked = f"from {start} on" if end is None else f"{start} to {end}"
+        raise SaccadeError(f"episode {episode} of {log} has the steps {min(steps)} to {max(steps)}: none of {asked}")
+    last = max(*steps, before.end or 0)
+    kept = Range(episode, max(start, before.start), last if end is None else min(end, last))
+    return kept, (min(first for first, _ in chosen.values()), max(last for _, last in chosen.values()))
+
+
+def _kept(entry: Recorded, kept: Range, times: tuple[int, int]) -> int | None:
+    """The sequence number of an entry that belongs to the cut; None of one that does not."""
+    try:
+        message = decode(entry.topic.type, entry.payload)
+    except MessageError:
+        return None
+    if not entry.topic.in_step:
+        return message.seq if times[0] <= entry.log_time_ns <= times[1] else None
+    first = 0 if entry.topic.latched else kept.start
+    return message.seq if message.episode == kept.episode and first <= message.step <= kept.end else None

@@ -1,0 +1,224 @@
+"""A run as Foxglove's messages: what the camera saw, where it was and went, what was believed, planned and true.
+
+Frames: `world` as everywhere, and a frame for each camera as Foxglove and Rerun want it, its optical one: along +z it
+looks, +x is right, +y down; ours looks along -z and has +y up. Both viewers draw all there is but the SceneUpdates
+(labels, ellipsoids, the path as a line): those are Foxglove's alone, and beside names tell nothing that is not drawn.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from typing import Any
+
+import foxglove.messages as fm
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from saccade.app.palette import COLOURS
+from saccade.shared.bus.messages import Belief, Frame, Goal, Message, Plan, Truth
+from saccade.shared.bus.topics import BELIEF, FRAME, GOAL, PLAN, TRUTH, Topic
+
+Told = tuple[str, Any]  # a topic and a message for it
+
+WORLD, CAMERA, GOAL_CAMERA, VIEWPOINT = "world", "camera_optical", "goal_optical", "viewpoint_optical"
+NOWHERE = ""  # a frame without a way to the world would keep Rerun from drawing the others together
+CAMERA_FROM_OPTICAL = np.diag([1.0, -1.0, -1.0, 1.0])
+MOST_VIEWS = 2000  # of the path: each message holds all of it, so that it is there wherever one looks in the log
+TRUE, PATH = (0.9, 0.1, 0.9), (0.6, 0.6, 0.6)  # on dark and on light ground
+LABEL_M, MARK_M, YAW_M = 0.03, 0.02, 0.08  # sizes: letters, a true centre's mark, the arrow along its yaw
+
+POINT = np.dtype([("xyz", "<f4", 3), ("rgba", "u1", 4)])
+_FLOAT, _BYTE = fm.PackedElementFieldNumericType.Float32, fm.PackedElementFieldNumericType.Uint8
+POINT_FIELDS = [*(fm.PackedElementField(name=name, offset=4 * i, type=_FLOAT) for i, name in enumerate("xyz")),
+                *(fm.PackedElementField(name=name, offset=12 + i, type=_BYTE)
+                  for i, name in enumerate(("red", "green", "blue", "alpha")))]
+
+
+class Scene:
+    """Takes a log's messages in their order. `goal_view_is_known`: the truth's goal pose is that of the goal image."""
+
+    def __init__(self, *, goal_view_is_known: bool) -> None:
+        self.goal_view_is_known = goal_view_is_known
+        self._objects: set[str] = set()
+        self._colours: dict[str, tuple[float, float, float]] = {}
+        self._episode = -1
+        self._ways: dict[int, NDArray[np.float64]] = {}  # the camera's position at each step of the episode
+        self._seen: Frame | None = None
+        self._goal_seen: Goal | None = None
+        self._goal_posed = -1  # the episode whose goal pose has been told
+
+    def take(self, topic: Topic, part: str | None, message: Message, time_ns: int) -> Iterator[Told]:
+        """What there is to show of a message, logged at `time_ns`."""
+        show = {FRAME: self._frame, GOAL: self._goal, BELIEF: self._belief, PLAN: self._plan, TRUTH: self._truth}
+        if part is not None and topic.in_step:
+            self._objects.add(part)
+        if topic in show:
+            yield from show[topic](message, fm.Timestamp(*divmod(time_ns, 10 ** 9)))
+
+    def _frame(self, frame: Frame, at: fm.Timestamp) -> Iterator[Told]:
+        self._seen = frame
+        yield "/camera/image", image(frame.rgb, CAMERA, at)
+        yield "/camera/calibration", calibration(frame.intrinsics_px, frame.rgb.shape[:2], CAMERA, at)
+        if frame.depth_m is not None:
+            yield "/camera/depth", depth_image(frame.depth_m, CAMERA, at)
+        yield from camera_pose("/camera/pose", frame.world_from_camera, CAMERA, at)
+        yield from self._way(frame, at)
+
+    def _goal(self, goal: Goal, at: fm.Timestamp) -> Iterator[Told]:
+        self._goal_seen = goal
+        if goal.rgb is not None and goal.episode != self._goal_posed:
+            yield "/goal/image", image(goal.rgb, NOWHERE, at)
+        else:
+            yield from self._goal_view(at)
+
+    def _goal_view(self, at: fm.Timestamp) -> Iterator[Told]:
+        """The goal's image at its pose, once both are known."""
+        goal = self._goal_seen
+        if goal is not None and goal.rgb is not None and goal.episode == self._goal_posed:
+            yield "/goal/image", image(goal.rgb, GOAL_CAMERA, at)
+            yield "/goal/calibration", calibration(goal.intrinsics_px, goal.rgb.shape[:2], GOAL_CAMERA, at)
+
+    def _truth(self, truth: Truth, at: fm.Timestamp) -> Iterator[Told]:
+        if self.goal_view_is_known:
+            yield from camera_pose("/goal/pose", truth.goal_world_from_camera, GOAL_CAMERA, at)
+            if truth.episode != self._goal_posed:
+                self._goal_posed = truth.episode
+                yield from self._goal_view(at)
+        yield "/truth/objects", cloud(truth.centers_m, TRUE, 1.0, at)
+        yield "/truth/labels", update("objects", at, spheres=[
+            fm.SpherePrimitive(pose=pose(np.eye(3), center), size=vector([MARK_M] * 3), color=colour(TRUE))
+            for center in truth.centers_m], arrows=[
+            fm.ArrowPrimitive(pose=pose(Rotation.from_euler("z", yaw).as_matrix(), center), color=colour(TRUE, 0.5),
+                              shaft_length=YAW_M, shaft_diameter=0.005, head_length=0.02, head_diameter=0.012)
+            for center, yaw in zip(truth.centers_m, truth.yaws_rad, strict=False)], texts=[
+            label(f"{name} (target)" if name == truth.target else name, center, TRUE)
+            for name, center in zip(truth.names, truth.centers_m, strict=False)])
+        yield from self._way(truth, at)
+
+    def _way(self, message: Frame | Truth, at: fm.Timestamp) -> Iterator[Told]:
+        """The path so far, once a step: the last one has a truth and no frame, and does not move the camera away from
+        its last image; a real camera has frames and no truth. What was recorded late goes where it belongs."""
+        if message.episode > self._episode:
+            self._episode, self._ways = message.episode, {}
+        if message.episode < self._episode or message.step in self._ways:
+            return
+        self._ways[message.step] = message.world_from_camera[:3, 3]
+        if len(self._ways) > MOST_VIEWS:
+            del self._ways[min(self._ways)]
+        path = np.array([self._ways[step] for step in sorted(self._ways)])
+        yield "/camera/path", cloud(path, PATH, 1.0, at)
+        yield "/camera/track", update("track", at, lines=[
+            fm.LinePrimitive(points=[fm.Point3(x=x, y=y, z=z) for x, y, z in path.tolist()], thickness=2.0,
+                             scale_invariant=True, color=colour(PATH))])
+
+    def _belief(self, belief: Belief, at: fm.Timestamp) -> Iterator[Told]:
+        rgb = self._colour(belief.object)
+        yield f"/belief/{belief.object}/particles", cloud(belief.particles_m, rgb, belief.presence, at)
+        text = f"{belief.object} {belief.presence:.0%}"
+        yield f"/belief/{belief.object}/spread", update(belief.object, at, spheres=[ellipsoid(belief, rgb)],
+                                                        texts=[label(text, belief.mean_m, rgb)])
+
+    def _colour(self, name: str) -> tuple[float, float, float]:
+        """As in the run's picture: by the order of the names, all of which have percepts before the first belief."""
+        if name not in self._colours:
+            for new in sorted(self._objects - self._colours.keys()):
+                self._colours[new] = _rgb(COLOURS[len(self._colours) % len(COLOURS)])
+        return self._colours[name]
+
+    def _plan(self, plan: Plan, at: fm.Timestamp) -> Iterator[Told]:
+        yield from camera_pose("/plan/pose", plan.viewpoint, VIEWPOINT, at)
+        if self._seen is not None:  # with its calibration a viewer draws the viewpoint's frustum
+            yield "/plan/calibration", calibration(self._seen.intrinsics_px, self._seen.rgb.shape[:2], VIEWPOINT, at)
+
+
+def image(rgb: NDArray[np.uint8], frame: str, at: fm.Timestamp) -> fm.CompressedImage:
+    """An image [H, W, 3] as PNG, exact: at the lowest level it takes 5 ms and, of flat-shaded scenes, no more room than
+    a JPEG that would do."""
+    data = io.BytesIO()
+    Image.fromarray(rgb).save(data, format="PNG", compress_level=1)
+    return fm.CompressedImage(timestamp=at, frame_id=frame, data=data.getvalue(), format="png")
+
+
+def depth_image(depth_m: NDArray[np.float32], frame: str, at: fm.Timestamp) -> fm.RawImage:
+    """Depth along the optical axis [H, W], metres."""
+    height, width = depth_m.shape
+    return fm.RawImage(timestamp=at, frame_id=frame, width=width, height=height, encoding="32FC1", step=4 * width,
+                       data=depth_m.astype("<f4").tobytes())
+
+
+def calibration(intrinsics_px: ArrayLike, size_px: tuple[int, int], frame: str,
+                at: fm.Timestamp) -> fm.CameraCalibration:
+    """A pinhole camera of (fx, fy, cx, cy) and (height, width) in pixels, without distortion."""
+    fx, fy, cx, cy = (float(x) for x in intrinsics_px)
+    height, width = size_px
+    return fm.CameraCalibration(timestamp=at, frame_id=frame, width=width, height=height,
+                                K=[fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0], R=np.eye(3).ravel().tolist(),
+                                P=[fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0])
+
+
+def camera_pose(topic: str, world_from_camera: NDArray[np.float64], frame: str, at: fm.Timestamp) -> Iterator[Told]:
+    """Where an OpenGL camera [4, 4] is, as the transform of its optical frame; nothing of a matrix that is no pose."""
+    world_from_optical = world_from_camera @ CAMERA_FROM_OPTICAL
+    rotation = world_from_optical[:3, :3]
+    if np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) and np.linalg.det(rotation) > 0:
+        yield topic, fm.FrameTransform(timestamp=at, parent_frame_id=WORLD, child_frame_id=frame,
+                                       translation=vector(world_from_optical[:3, 3]), rotation=quaternion(rotation))
+
+
+def cloud(points_m: NDArray[Any], rgb: tuple[float, float, float], alpha: float, at: fm.Timestamp) -> fm.PointCloud:
+    """Points [N, 3] of one colour in the world."""
+    packed = np.empty(len(points_m), POINT)
+    packed["xyz"], packed["rgba"] = points_m, np.round(255 * np.array([*rgb, alpha]))
+    return fm.PointCloud(timestamp=at, frame_id=WORLD, pose=pose(np.eye(3), np.zeros(3)), point_stride=POINT.itemsize,
+                         fields=POINT_FIELDS, data=packed.tobytes())
+
+
+def ellipsoid(belief: Belief, rgb: tuple[float, float, float]) -> fm.SpherePrimitive:
+    """The believed position within one standard deviation along each axis."""
+    variances, axes = np.linalg.eigh(belief.covariance_m2)
+    axes = axes * np.sign(np.linalg.det(axes))  # a rotation, not a mirror
+    return fm.SpherePrimitive(pose=pose(axes, belief.mean_m), color=colour(rgb, 0.3 * belief.presence),
+                              size=vector(2 * np.sqrt(np.maximum(variances, 1e-10))))
+
+
+def label(text: str, at_m: ArrayLike, rgb: tuple[float, float, float]) -> fm.TextPrimitive:
+    """A text that faces the viewer, above a position [3]."""
+    above = np.add(at_m, (0.0, 0.0, LABEL_M))
+    return fm.TextPrimitive(pose=pose(np.eye(3), above), billboard=True, font_size=LABEL_M, color=colour(rgb),
+                            text=text)
+
+
+def update(name: str, at: fm.Timestamp, **primitives: list[Any]) -> fm.SceneUpdate:
+    """One entity in the world, which replaces that of the same name on its topic."""
+    return fm.SceneUpdate(entities=[fm.SceneEntity(timestamp=at, frame_id=WORLD, id=name, **primitives)])
+
+
+def pose(rotation: ArrayLike, position_m: ArrayLike) -> fm.Pose:
+    """A rotation [3, 3] and a position [3]."""
+    return fm.Pose(position=vector(position_m), orientation=quaternion(rotation))
+
+
+def vector(xyz: ArrayLike) -> fm.Vector3:
+    """Three numbers."""
+    x, y, z = (float(value) for value in xyz)
+    return fm.Vector3(x=x, y=y, z=z)
+
+
+def quaternion(rotation: ArrayLike) -> fm.Quaternion:
+    """Of a rotation [3, 3]."""
+    x, y, z, w = Rotation.from_matrix(rotation).as_quat().tolist()
+    return fm.Quaternion(x=x, y=y, z=z, w=w)
+
+
+def colour(rgb: tuple[float, float, float], alpha: float = 1.0) -> fm.Color:
+    """A colour of parts between 0 and 1."""
+    return fm.Color(r=rgb[0], g=rgb[1], b=rgb[2], a=alpha)
+
+
+def _rgb(code: str) -> tuple[float, float, float]:
+    """Of "#rrggbb"."""
+    red, green, blue = bytes.fromhex(code[1:])
+    return red / 255, green / 255, blue / 255

@@ -1,0 +1,101 @@
+"""What commands on logs need: the valid messages and their times, and files that are there whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from rich.console import Console
+from rich.markup import escape
+
+from saccade.app.run.display import say
+from saccade.shared.bus.messages import Message
+from saccade.shared.bus.wire import MessageError, decode
+from saccade.shared.errors import SaccadeError
+from saccade.shared.log.folder import LOG_NAME
+from saccade.shared.log.reading import Recorded, RunReader
+
+SAY_EVERY = 50  # messages
+
+
+def log_of(run: Path) -> Path:
+    """The log of a run, which is given by its folder or by the log itself."""
+    return run / LOG_NAME if run.is_dir() else run
+
+
+class Log:
+    """A log as it is exported: iterating gives every valid message with its entry, and says on `console` how far it is
+    and, at the end, what the export lacks. Raises SaccadeError for a file that is no log or holds no message."""
+
+    def __init__(self, path: Path, console: Console | None = None) -> None:
+        self.reader = RunReader(path)
+        self.console = console or Console(stderr=True)
+        self.read = self.refused = 0
+
+    def __iter__(self) -> Iterator[tuple[Recorded, Message]]:
+        with self.console.status("reading") as status:
+            for entry in self.reader.entries():
+                try:
+                    message = decode(entry.topic.type, entry.payload)
+                except MessageError:
+                    self.refused += 1
+                    continue
+                yield entry, message
+                self.read += 1
+                if self.read % SAY_EVERY == 0:
+                    status.update(f"{self.read} messages of {escape(self.reader.path.name)}")
+        if not self.read:
+            raise SaccadeError(f"log {self.reader.path} holds no messages of Saccade: give the run.mcap of a run")
+        for line in self.lacks.values():
+            say(self.console, line)
+
+    @property
+    def lacks(self) -> dict[str, str]:
+        """What an export of this log cannot hold, known once it is read: `cut` and `refused`, where there is such."""
+        refused = f"{self.refused} entries of {self.reader.path} are no valid messages and were left out"
+        return ({"cut": self.reader.cut} if self.reader.cut else {}) | ({"refused": refused} if self.refused else {})
+
+    @property
+    def goal_view_is_known(self) -> bool:
+        """Whether the truth's goal pose is that of the goal image; known from the first message on."""
+        scene = json.loads(self.reader.configuration or "{}").get("scene", {})
+        return scene.get("goal_image") is None and not scene.get("explore")
+
+
+@contextmanager
+def whole(out: Path) -> Iterator[Path]:
+    """A path beside `out`, for a file or a folder, that becomes `out` when all is well and is removed when it is not.
+    Raises SaccadeError if `out` is there already or cannot be written."""
+    if out.exists():
+        raise SaccadeError(f"{out} is there already: name a new place")
+    partial = out.with_name(f"{out.name}.part")
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        _remove(partial)
+        yield partial
+        partial.rename(out)
+    except OSError as error:
+        raise SaccadeError(f"{out} cannot be written: {error.strerror or error}") from error
+    finally:
+        _remove(partial)
+
+
+@contextmanager
+def extra() -> Iterator[None]:
+    """Around imports of what only exporting needs. Raises SaccadeError where it is not installed."""
+    try:
+        yield
+    except ImportError as error:
+        what = error.name or error
+        raise SaccadeError(f"exporting needs the package {what}: pip install 'saccade[export]'") from error
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with suppress(OSError):
+            path.unlink()

@@ -1,0 +1,94 @@
+"""The messages of one topic as a Parquet table: a row per message, columns by its dataclass.
+
+Texts, numbers and truth values are columns of their own type. Arrays are lists in row-major order, of fixed length
+where the message fixes the shape (which stands in the column's metadata); where it does not, `<name>_shape` says the
+shape of each row, and the numbers are left out (null) of a row that has more than a few. Images leave only their shape.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from saccade.app.log.fields import IMAGE, fixed_numbers, kinds
+from saccade.shared.bus.messages import ArraySpec, Message
+from saccade.shared.bus.topics import Topic
+from saccade.shared.log.reading import Recorded
+
+ROW_GROUP = 1024  # rows: what is held in memory
+MOST_NUMBERS = 64  # of an array that is told in full: 21 positions, but no cloud and no map
+TYPES = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_(), list[str]: pa.list_(pa.string())}
+NUMBERS = {"f4": pa.float32(), "f8": pa.float64()}
+
+
+class Column(NamedTuple):
+    """One column and where its value comes from."""
+
+    field: pa.Field
+    value: Callable[[Recorded, Message], Any]
+
+
+class Table:
+    """The table of a topic while it is written, `ROW_GROUP` rows at a time."""
+
+    def __init__(self, path: Path, topic: Topic) -> None:
+        self.path = path
+        self._columns = columns(topic)
+        about = {"topic": topic.name, "message": topic.type.__name__, "description": (topic.type.__doc__ or "").strip()}
+        self._schema = pa.schema([column.field for column in self._columns], metadata=about)
+        self._writer = pq.ParquetWriter(path, self._schema, compression="zstd")
+        self._rows: list[list[Any]] = []
+
+    def add(self, entry: Recorded, message: Message) -> None:
+        """Appends one row."""
+        self._rows.append([column.value(entry, message) for column in self._columns])
+        if len(self._rows) == ROW_GROUP:
+            self._write()
+
+    def close(self, lacks: dict[str, str]) -> None:
+        """Writes the rest; `lacks` stands in the file's metadata."""
+        self._write()
+        self._writer.add_key_value_metadata(lacks)
+        self._writer.close()
+
+    def _write(self) -> None:
+        if self._rows:
+            arrays = [pa.array(values, field.type)
+                      for values, field in zip(zip(*self._rows, strict=True), self._schema, strict=True)]
+            self._writer.write_batch(pa.RecordBatch.from_arrays(arrays, schema=self._schema))
+            self._rows = []
+
+
+def columns(topic: Topic) -> list[Column]:
+    """The columns of a topic's table: when and of which part, then the message's fields in their order."""
+    result = [Column(pa.field("log_time", pa.timestamp("ns", tz="UTC")), lambda entry, _: entry.log_time_ns)]
+    if topic.parts:
+        result.append(Column(pa.field("part", pa.string()), lambda entry, _: entry.part))
+    for name, kind in kinds(topic.type).items():
+        result += _of_array(name, kind) if isinstance(kind, ArraySpec) else [
+            Column(pa.field(name, TYPES[kind]), lambda _, message, name=name: getattr(message, name))]
+    return result
+
+
+def _of_array(name: str, spec: ArraySpec) -> list[Column]:
+    def shape(_: Recorded, message: Message) -> list[int] | None:
+        value = getattr(message, name)
+        return None if value is None else list(value.shape)
+
+    def numbers(_: Recorded, message: Message) -> np.ndarray | None:
+        value = getattr(message, name)
+        return None if value is None or value.size > MOST_NUMBERS else value.ravel()
+
+    count = fixed_numbers(spec)
+    if count is not None and count <= MOST_NUMBERS:
+        told = {"shape": "x".join(str(side) for side in spec.shape)}
+        return [Column(pa.field(name, pa.list_(NUMBERS[spec.dtype], count), metadata=told), numbers)]
+    shapes = Column(pa.field(f"{name}_shape", pa.list_(pa.int32(), len(spec.shape))), shape)
+    if spec.dtype == IMAGE:
+        return [shapes]
+    return [Column(pa.field(name, pa.list_(NUMBERS[spec.dtype])), numbers), shapes]

@@ -1,0 +1,135 @@
+"""`saccade hz`: how often messages come, and how evenly."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+
+from rich.console import Console
+from rich.live import Live as Display
+from rich.table import Table
+
+from saccade.app.log.source import log_of
+from saccade.app.look.listen import TICK_S, Live, Logged, Wanted, live, until_interrupted
+from saccade.app.run.display import say
+from saccade.shared.bus.topics import Topic
+
+WINDOW_S = 10.0
+MOST = 10_000  # messages of one key that a window holds
+LINES_EVERY_S = 1.0
+
+
+@dataclass
+class Rate:
+    """The messages of one key: `count` in all, and the times (s) and sizes of those in the window."""
+
+    count: int = 0
+    recent: deque[tuple[float, int]] = field(default_factory=lambda: deque(maxlen=MOST))
+
+    def values(self) -> tuple[int, float, float, float, float]:
+        """Count; rate (1/s), mean interval (s), its standard deviation (s) and bytes per second within the window, all
+        NaN while it has no two messages at different times."""
+        times = sorted(at for at, _ in self.recent)  # what was asked for again stands in a log out of its turn
+        span = times[-1] - times[0] if times else 0.0
+        if span <= 0:
+            return self.count, math.nan, math.nan, math.nan, math.nan
+        intervals = len(times) - 1
+        mean = span / intervals
+        jitter = math.sqrt(sum((b - a - mean) ** 2 for a, b in pairwise(times)) / intervals)
+        size = sum(size for _, size in self.recent) - self.recent[0][1]
+        return self.count, intervals / span, mean, jitter, size / span
+
+
+class Rates:
+    """Rates by key, of the last `window_s` seconds. Safe between threads."""
+
+    def __init__(self, window_s: float = math.inf, most: int | None = MOST) -> None:
+        self.total, self._window_s, self._most = 0, window_s, most
+        self._rates: dict[tuple[Topic, str | None], Rate] = {}
+        self._lock = threading.Lock()
+
+    def take(self, topic: Topic, part: str | None, size: int, at_s: float) -> None:
+        """One message of `size` bytes that came at a time."""
+        with self._lock:
+            rate = self._rates.setdefault((topic, part), Rate(recent=deque(maxlen=self._most)))
+            rate.count += 1
+            rate.recent.append((at_s, size))
+            self.total += 1
+
+    def rows(self, world: str, now_s: float = -math.inf) -> list[tuple[str, ...]]:
+        """Key, count, rate, mean interval, jitter and bytes per second, as text."""
+        with self._lock:
+            for rate in self._rates.values():
+                while rate.recent and rate.recent[0][0] < now_s - self._window_s:
+                    rate.recent.popleft()
+            return sorted((topic.key(world, part), *_texts(rate.values()))
+                          for (topic, part), rate in self._rates.items())
+
+
+def hz(key: str, *, log: Path | None, count: int | None, endpoint: str | None, run: Path | None,
+       console: Console | None = None) -> None:
+    """Shows rates until Ctrl-C or `count` messages, or those of a log. Raises SaccadeError where nothing can come."""
+    console, wanted = console or Console(), Wanted.parse(key)
+    if log is None:
+        with closing(live(wanted, endpoint=endpoint, run=run)) as source:
+            follow(source, count, console)
+        return
+    source, rates = Logged(wanted, log_of(log)), Rates(most=None)
+    for heard in source.heard():
+        rates.take(heard.topic, heard.part, len(heard.payload), heard.time_ns / 1e9)
+        if rates.total == count:
+            break
+    _tell(console, rates, source.world)
+    if source.reader.cut:
+        say(console, source.reader.cut)
+
+
+def follow(source: Live, count: int | None, console: Console) -> Rates:
+    """Shows the rates of what comes on a bus. Nothing waits in a queue here, so nothing is dropped."""
+    rates, told_s = Rates(WINDOW_S), time.monotonic()
+    source.listen(lambda topic, part, payload: rates.take(topic, part, len(payload), time.monotonic()))
+    with until_interrupted(source.stop), Display(console=console, auto_refresh=False, transient=True) as display:
+        while not source.inbox.stopping.wait(TICK_S) and (count is None or rates.total < count):
+            now_s = time.monotonic()
+            if console.is_terminal:
+                display.update(_table(rates.rows(source.world, now_s)), refresh=True)
+            elif now_s - told_s >= LINES_EVERY_S:
+                told_s = now_s
+                _tell(console, rates, source.world, now_s)
+    _tell(console, rates, source.world, time.monotonic())
+    return rates
+
+
+def _tell(console: Console, rates: Rates, world: str, now_s: float = -math.inf) -> None:
+    for line in _lines(rates.rows(world, now_s)):
+        say(console, line)
+
+
+def _lines(rows: list[tuple[str, ...]]) -> Iterator[str]:
+    for key, count, rate, interval, jitter, size in rows:
+        yield f"{key}: {count} messages, {rate} Hz, every {interval} ms ± {jitter} ms, {size} B/s"
+    if not rows:
+        yield "no messages"
+
+
+def _table(rows: list[tuple[str, ...]]) -> Table:
+    table = Table()
+    for header in ("key", "messages", "Hz", "interval ms", "jitter ms", "bytes/s"):
+        table.add_column(header, justify="left" if header == "key" else "right", no_wrap=True)
+    for row in rows:
+        table.add_row(*row)
+    return table
+
+
+def _texts(values: tuple[int, float, float, float, float]) -> tuple[str, ...]:
+    count, rate, interval, jitter, size = values
+    if math.isnan(rate):
+        return (str(count), *"----")
+    return str(count), f"{rate:.2f}", f"{interval * 1e3:.1f}", f"{jitter * 1e3:.1f}", f"{size:,.0f}"

@@ -1,0 +1,207 @@
+"""Listening to messages from outside: which ones, on a run's bus or in a log. A run never waits for who listens."""
+
+from __future__ import annotations
+
+import re
+import signal
+import socket
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import NamedTuple
+
+from saccade.shared.bus.topics import ROOT, TOPICS, Topic
+from saccade.shared.bus.transport import ZenohBus
+from saccade.shared.config import Config, load
+from saccade.shared.errors import SaccadeError
+from saccade.shared.log.folder import CONFIG_NAME
+from saccade.shared.log.reading import RunReader
+from saccade.shared.loop.process import Inbox
+
+RUNS = Path("runs")
+QUEUE_BYTES = 64 * 1024 * 1024  # of messages that wait to be shown; what does not fit is dropped and counted
+TICK_S = 0.2
+CONNECT_S = 3.0
+PROBE_S = 0.3
+NEWEST = 20  # run folders that are tried
+
+
+class Heard(NamedTuple):
+    """A message as it was on the wire, and when it came (ns)."""
+
+    topic: Topic
+    part: str | None
+    payload: bytes
+    time_ns: int
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """Which keys are listened to; `*` stands for anything. `world`: None where it was not said."""
+
+    topic: str
+    part: str
+    world: str | None = None
+
+    @classmethod
+    def parse(cls, key: str) -> Wanted:
+        """Of a full key, or of topic[/part]. Raises SaccadeError where no key of ours can be meant."""
+        pieces = key.split("/")
+        world = None
+        if pieces[0] == ROOT and len(pieces) > 2:
+            world, pieces = pieces[1], pieces[2:]
+        wanted = cls(pieces[0], "/".join(pieces[1:]) or "*", world)
+        if not wanted.topics or not re.fullmatch(r"\*|[A-Za-z0-9_-]{1,64}", world or "*"):
+            raise SaccadeError(f"key {key!r} is none of Saccade's: give {ROOT}/<world>/<topic>[/<part>] or "
+                               f"<topic>[/<part>] with a topic of {', '.join(TOPICS)}; * stands for any")
+        return wanted
+
+    @property
+    def topics(self) -> list[Topic]:
+        """The topics it can mean."""
+        return [topic for topic in TOPICS.values()
+                if fnmatchcase(topic.name, self.topic) and (topic.parts or self.part in ("*", "**"))]
+
+    def matches(self, topic: Topic, part: str | None) -> bool:
+        """Whether it means this key."""
+        return topic in self.topics and (part is None or fnmatchcase(part, self.part))
+
+
+class Live:
+    """The messages of a bus while they are published: copied into a queue, or dropped and counted where that is full.
+
+    `endpoint`: the bus's address. Raises SaccadeError if nothing answers there.
+    """
+
+    def __init__(self, wanted: Wanted, endpoint: str, world: str, limit_bytes: int = QUEUE_BYTES) -> None:
+        self.wanted, self.world, self.inbox = wanted, world, Inbox(limit_bytes)
+        self._bus = ZenohBus(endpoint, world=world, onlooker=True, timeout_s=CONNECT_S)
+
+    @property
+    def dropped(self) -> int:
+        """How many came while the queue was full."""
+        return self.inbox.dropped
+
+    def heard(self) -> Iterator[Heard | None]:
+        """From now on until `stop`, with None now and then while nothing comes. What holds for the whole episode and
+        was published before is asked for first."""
+        self.listen(self._put)
+        known = set()
+        for heard in self.earlier():
+            known.add(heard.payload)
+            yield heard
+        while not self.inbox.stopping.is_set():
+            item = self.inbox.get(TICK_S)
+            if item is None:
+                yield None
+            elif not item[0].latched or item[2] not in known:
+                yield Heard(*item, time.time_ns())
+
+    def earlier(self) -> list[Heard]:
+        """What holds for the whole episode and was published before, as its publishers know it."""
+        kept = self._bus.recall([topic for topic in self.wanted.topics if topic.latched])
+        return [Heard(k.topic, k.part, k.payload, k.published_ns) for k in kept if self.wanted.matches(k.topic, k.part)]
+
+    def listen(self, deliver: Callable[[Topic, str | None, bytes], None]) -> None:
+        """Calls `deliver` on the bus's thread for what is wanted; it must not wait."""
+        def take(topic: Topic, part: str | None, payload: bytes) -> None:
+            if self.wanted.matches(topic, part):
+                deliver(topic, part, payload)
+
+        self._bus.subscribe(self.wanted.topics, take)
+
+    def stop(self) -> None:
+        """Ends `heard`. Safe in a signal handler."""
+        self.inbox.stop()
+
+    def close(self) -> None:
+        """Leaves the bus."""
+        self._bus.close()
+
+    def _put(self, topic: Topic, part: str | None, payload: bytes) -> None:
+        self.inbox.put(topic, part, payload)
+
+
+class Logged:
+    """The messages of a log. `world` is known with the first. Raises SaccadeError if it is none."""
+
+    dropped = 0
+
+    def __init__(self, wanted: Wanted, log: Path) -> None:
+        self.wanted, self.reader = wanted, RunReader(log)
+
+    @property
+    def world(self) -> str:
+        """The log's world."""
+        return self.reader.world
+
+    def heard(self) -> Iterator[Heard]:
+        """From the first to the last. Raises SaccadeError where the world of the log is not the one wanted."""
+        for entry in self.reader.entries():
+            if not fnmatchcase(self.world, self.wanted.world or "*"):
+                raise SaccadeError(f"log {self.reader.path} is of world {self.world!r}, not {self.wanted.world!r}")
+            if self.wanted.matches(entry.topic, entry.part):
+                yield Heard(*entry)
+
+
+def live(wanted: Wanted, *, endpoint: str | None, run: Path | None) -> Live:
+    """The messages of a run that goes on, of `config_of`. Raises SaccadeError where none does."""
+    bus = config_of(endpoint=endpoint, run=run).bus
+    return Live(wanted, bus.endpoint, bus.world if wanted.world in (None, "*") else wanted.world)
+
+
+def config_of(*, endpoint: str | None, run: Path | None) -> Config:
+    """The configuration of the run in a folder, or of the newest whose bus answers; of one at an endpoint nothing else
+    is known. Raises SaccadeError where there is none."""
+    if endpoint is not None and run is not None:
+        raise SaccadeError("--endpoint and --run both name a bus: give one of them")
+    if endpoint is not None:
+        return Config().with_values({"bus.endpoint": endpoint})
+    folder = run or newest_run()
+    return on_bus(folder).with_values({"run": folder.resolve().name})
+
+
+def on_bus(run: Path) -> Config:
+    """The configuration in a run's folder. Raises SaccadeError where the run had no bus."""
+    config = load(run / CONFIG_NAME)
+    if config.bus.kind != "zenoh" or config.bus.endpoint.endswith(":0"):
+        raise SaccadeError(f"run {run} was within one process and has no bus: give its log with --log")
+    return config
+
+
+def newest_run(runs: Path = RUNS) -> Path:
+    """The folder of the newest run whose bus answers."""
+    with suppress(OSError):
+        folders = sorted((path.stat().st_mtime_ns, path.parent) for path in runs.glob(f"*/{CONFIG_NAME}"))
+        for _, folder in folders[:-NEWEST - 1:-1]:
+            with suppress(SaccadeError):
+                if answers(on_bus(folder).bus.endpoint):
+                    return folder
+    raise SaccadeError(f"no run in {runs.absolute()} is on a bus now: give --endpoint, --run or --log")
+
+
+def answers(endpoint: str) -> bool:
+    """Whether somebody listens at a TCP endpoint."""
+    match = re.fullmatch(r"tcp/\[?([^\[\]]+)\]?:(\d+)", endpoint)
+    with suppress(OSError, OverflowError), socket.create_connection((match[1], int(match[2])) if match else ("", 0),
+                                                                    timeout=PROBE_S):
+        return True
+    return False
+
+
+@contextmanager
+def until_interrupted(stop: Callable[[], None]) -> Iterator[None]:
+    """Within it Ctrl-C and SIGTERM call `stop`, a second one ends the process at once."""
+    def on_signal(number: int, _frame: object) -> None:
+        signal.signal(number, signal.SIG_DFL)
+        stop()
+
+    before = {number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

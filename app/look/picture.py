@@ -1,0 +1,209 @@
+"""A run in one picture, from its log: the goal, the last view, the table from above with what was believed, and
+the free energy."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from itertools import cycle
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from saccade.app.palette import COLOURS
+from saccade.services.simulator.world import TABLE_SIDE_M
+from saccade.shared.bus.messages import Belief, Message, Plan, Result, Truth
+from saccade.shared.bus.topics import BELIEF, FRAME, GOAL, PLAN, RESULT, TRUTH, Topic
+from saccade.shared.errors import SaccadeError
+from saccade.shared.log.folder import LOG_NAME, PICTURE_NAME
+from saccade.shared.log.reading import RunReader
+
+INCHES, DPI = (21.0, 5.2), 100
+SHOWN_M = 0.62  # half the side of the view from above: the table and the camera's workspace
+PRESENT_ABOVE = 0.5
+F_TERMS = {"f_identity": "#264653", "f_position": "#2a9d8f", "f_crop": "#8ab17d", "f_pose": "#bcb8b1",
+           "f_likelihood": "#e0ddd6"}  # in other colours than the objects'
+TOLD = (GOAL, FRAME, BELIEF, TRUTH, PLAN, RESULT)
+
+
+@dataclass
+class Story:
+    """What the messages of one episode tell: images [H, W, 3], and for each step the camera's position [3] and the
+    terms of F summed over the objects [5], nats."""
+
+    episode: int
+    goal_rgb: NDArray[np.uint8] | None = None
+    goal_is_known: bool = False  # that its view is the truth's, not that of an image from elsewhere
+    last_rgb: NDArray[np.uint8] | None = None
+    last_step: int = 0  # of `last_rgb`: the last move has no view of its own
+    ways: dict[int, NDArray[np.float64]] = field(default_factory=dict)
+    beliefs: dict[str, Belief] = field(default_factory=dict)
+    energies: dict[int, NDArray[np.float64]] = field(default_factory=dict)
+    truth: Truth | None = None
+    plan: Plan | None = None
+    result: Result | None = None
+
+    @property
+    def path_m(self) -> list[NDArray[np.float64]]:
+        """The camera's positions in their order."""
+        return [self.ways[step] for step in sorted(self.ways)]
+
+    def take(self, topic: Topic, part: str | None, message: Message) -> None:
+        """Notes what a message of this episode says."""
+        if topic == GOAL:
+            self.goal_rgb = message.rgb
+        elif topic == FRAME:
+            self.last_rgb, self.last_step = message.rgb, message.step
+        elif topic == BELIEF:
+            self.beliefs[part] = message
+            terms = np.array([getattr(message, name) for name in F_TERMS])
+            self.energies[message.step] = self.energies.get(message.step, 0.0) + terms
+        elif topic == TRUTH:
+            self.truth = message
+        elif topic == PLAN:
+            self.plan = message
+        elif topic == RESULT:
+            self.result = message
+        if topic in (FRAME, TRUTH):  # the last step has a truth and no frame; a real camera has frames and no truth
+            self.ways[message.step] = message.world_from_camera[:3, 3]
+
+
+def read_story(log: Path, episode: int | None = None) -> Story:
+    """The last episode of a log, or the one that is asked for. Raises SaccadeError if the log has no frame of it."""
+    story = Story(-1 if episode is None else episode)
+    reader = RunReader(log)
+    for topic, part, message in reader:
+        if topic not in TOLD:
+            continue
+        if episode is None and message.episode > story.episode:
+            story = Story(message.episode)
+        if message.episode == story.episode:
+            story.take(topic, part, message)
+    if story.last_rgb is None:
+        which = "no episode" if episode is None else f"nothing of episode {episode}"
+        raise SaccadeError(f"log {log} has {which} in it: draw a log that holds frames")
+    story.goal_is_known = story.truth is not None and story.goal_rgb is not None and not _goal_from_elsewhere(reader)
+    return story
+
+
+def _goal_from_elsewhere(reader: RunReader) -> bool:
+    scene = json.loads(reader.configuration or "{}").get("scene", {})
+    return scene.get("goal_image") is not None
+
+
+def draw(log: Path, out: Path, episode: int | None = None) -> Story:
+    """Writes the picture of a logged episode as PNG and returns what it shows."""
+    story = read_story(log, episode)
+    draw_story(story, out)
+    return story
+
+
+def draw_run(folder: Path) -> Path:
+    """Writes the picture of a run's last episode beside its log; returns where."""
+    draw(folder / LOG_NAME, folder / PICTURE_NAME)
+    return folder / PICTURE_NAME
+
+
+def draw_story(story: Story, out: Path, *, dpi: int = DPI) -> None:
+    """Writes the picture of an episode as PNG: the goal, the last view, the table from above, the free energy."""
+    figure = new_figure(INCHES, dpi)
+    goal, view, above, energy = figure.subplots(1, 4, width_ratios=(1, 1, 1.35, 1))
+    image(goal, story.goal_rgb, "goal" if story.goal_rgb is not None else "no goal: exploring")
+    image(view, story.last_rgb, f"last view (step {story.last_step})")
+    _from_above(above, story)
+    _free_energy(energy, story)
+    figure.suptitle(_title(story))
+    save(figure, out)
+
+
+def new_figure(inches: tuple[float, float], dpi: int = DPI) -> Figure:
+    """A figure that needs no screen."""
+    figure = Figure(figsize=inches, dpi=dpi, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def save(figure: Figure, out: Path) -> None:
+    """Writes a figure; the same figure gives the same bytes. Raises SaccadeError where it cannot be written."""
+    try:
+        figure.savefig(out, metadata={"Software": None})
+    except OSError as error:
+        raise SaccadeError(f"picture {out} cannot be written: {error.strerror}") from error
+
+
+def image(axes: Axes, rgb: NDArray[np.uint8] | None, title: str) -> None:
+    """An image without axes, or the room for one."""
+    axes.set_title(title)
+    axes.axis("off")
+    if rgb is not None:
+        axes.imshow(rgb)
+
+
+def _from_above(axes: Axes, story: Story) -> None:
+    table_from_above(axes, "the table from above")
+    particles(axes, {name: b for name, b in story.beliefs.items() if b.presence > PRESENT_ABOVE}, story.beliefs)
+    if story.truth is not None:
+        axes.plot(*story.truth.centers_m[:, :2].T, "o", color="black", fillstyle="none", markersize=13,
+                  label="true position", linestyle="none", zorder=4)
+        if story.goal_is_known:
+            axes.plot(*story.truth.goal_world_from_camera[:2, 3], "*", color="black", markersize=13,
+                      label="goal's view", linestyle="none", zorder=4)
+    way(axes, np.array(story.path_m))
+    if (reach := 1.05 * float(np.abs(np.array(story.path_m)[:, :2]).max())) > SHOWN_M:  # a real camera's
+        axes.set(xlim=(-reach, reach), ylim=(-reach, reach))
+    axes.legend(loc="center left", bbox_to_anchor=(1.02, 0.5), fontsize=8, frameon=False)
+
+
+def _free_energy(axes: Axes, story: Story) -> None:
+    """F of all objects at each step, by term."""
+    axes.set(title="free energy of all objects", xlabel="step", ylabel="F (nats)")
+    if story.energies:
+        steps = sorted(story.energies)
+        terms = np.array([story.energies[step] for step in steps]).T
+        labels = [name.removeprefix("f_") for name in F_TERMS]
+        axes.stackplot(steps, terms, labels=labels, colors=list(F_TERMS.values()))
+        axes.legend(fontsize=8, frameon=False)
+
+
+def table_from_above(axes: Axes, title: str) -> None:
+    """The empty table, x to the right and y up."""
+    half = TABLE_SIDE_M / 2
+    axes.fill([-half, half, half, -half], [-half, -half, half, half], color="#efeae2", zorder=0)
+    axes.set(xlim=(-SHOWN_M, SHOWN_M), ylim=(-SHOWN_M, SHOWN_M), aspect="equal", xlabel="x (m)", ylabel="y (m)",
+             title=title)
+
+
+def particles(axes: Axes, beliefs: dict[str, Belief], names: Iterable[str]) -> None:
+    """Where objects are believed to be; each of `names` keeps its colour, whichever of them are drawn."""
+    for name, colour in colours(names).items():
+        if name in beliefs:
+            axes.scatter(*beliefs[name].particles_m[:, :2].T, s=4, color=colour, alpha=0.35, linewidths=0, zorder=2)
+            axes.plot(*beliefs[name].mean_m[:2], "o", color=colour, markersize=7, label=name, zorder=3)
+
+
+def colours(names: Iterable[str]) -> dict[str, str]:
+    """A colour for each object."""
+    return dict(zip(sorted(names), cycle(COLOURS), strict=False))
+
+
+def way(axes: Axes, path_m: NDArray[np.float64]) -> None:
+    """The camera's path [K, 3] and where it is now."""
+    axes.plot(*path_m[:, :2].T, "-", color="#555555", linewidth=1.5, label="camera's path", zorder=1)
+    axes.plot(*path_m[-1, :2], "s", color="#555555", markersize=7, zorder=3)
+
+
+def _title(story: Story) -> str:
+    if story.truth is None:
+        return f"a real camera: {len(story.path_m)} views"
+    if story.result is None:
+        return f"episode {story.episode}: cut short after {len(story.path_m)} views"
+    result = story.result
+    if story.goal_rgb is None:
+        return f"{result.scene}: explored for {result.steps} steps"
+    how = "reached" if result.success else "said to be reached" if result.declared else "not reached"
+    return f"{result.scene}: goal {how} after {result.steps} steps"

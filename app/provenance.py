@@ -1,0 +1,34 @@
+"""Where results come from: the machine, and paths that mean something elsewhere too."""
+
+from __future__ import annotations
+
+import os
+import platform
+from importlib import metadata
+from pathlib import Path
+
+from saccade.services.simulator.opengl import choose_backend
+from saccade.shared.config import PACKAGE
+
+PACKAGES = ("numpy", "torch", "mujoco")
+
+
+def machine() -> dict[str, str | int]:
+    """What may change the last bits of a result, and its seconds."""
+    return {"processor": _processor(), "cores": os.cpu_count() or 1, "system": platform.system(),
+            "python": platform.python_version(), "opengl": choose_backend(),
+            **{name: metadata.version(name) for name in PACKAGES}}
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()
+
+
+def shown(path: Path) -> str:
+    """A path relative to the repository where it is inside, else its name alone."""
+    resolved = path.resolve()
+    return str(resolved.relative_to(PACKAGE)) if resolved.is_relative_to(PACKAGE) else resolved.name

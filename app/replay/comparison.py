@@ -1,0 +1,142 @@
+"""What was said again against what was recorded, field by field, while both come in."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from saccade.app.replay.tolerances import IGNORED, tolerance_of
+from saccade.shared.bus.messages import Message
+from saccade.shared.bus.topics import Topic
+from saccade.shared.bus.wire import decode, stamp_of
+from saccade.shared.log.migrations import ADDED
+
+KEPT = 1_000  # differences that are told one by one
+
+At = tuple[str, str | None, int, int]  # topic, part, episode, step
+
+
+@dataclass(frozen=True)
+class Difference:
+    """One field of one message that is not as recorded. `size`: the largest |replayed - recorded| of its numbers; of
+    packed bits, the share of them that differs."""
+
+    topic: str
+    part: str | None
+    episode: int
+    step: int
+    field: str
+    recorded: str
+    replayed: str
+    size: float
+    tolerated: bool
+
+    def __str__(self) -> str:
+        where = f"{self.topic}{f'/{self.part}' if self.part else ''} episode {self.episode} step {self.step}"
+        return f"{where}: {self.field}: recorded {self.recorded}, replayed {self.replayed}"
+
+
+@dataclass
+class Comparison:
+    """Takes messages of the recording and of the replay in any order, each pair is compared when it is whole. Memory:
+    what one of the two is ahead of the other."""
+
+    compared: int = 0
+    unequal: int = 0  # messages that differ in a byte
+    beyond: int = 0  # of those, beyond what is tolerated
+    differences: list[Difference] = field(default_factory=list)
+    on_pair: Callable[[Topic, str | None, Message, Message], None] | None = None  # sees every recorded and replayed
+    _recorded: dict[At, tuple[Topic, bytes]] = field(default_factory=dict)
+    _replayed: dict[At, tuple[Topic, bytes]] = field(default_factory=dict)
+
+    def recorded(self, topic: Topic, part: str | None, payload: bytes) -> list[Difference]:
+        """The wire bytes of a message of the recording; the differences, if its twin is there."""
+        return self._take(self._recorded, self._replayed, topic, part, payload)
+
+    def replayed(self, topic: Topic, part: str | None, payload: bytes) -> list[Difference]:
+        """The wire bytes of a message of the replay; the differences, if its twin is there."""
+        return self._take(self._replayed, self._recorded, topic, part, payload)
+
+    @property
+    def equal(self) -> bool:
+        """Nothing differs beyond what is tolerated, and nothing is there on one side alone."""
+        return not (self.beyond or self._recorded or self._replayed)
+
+    @property
+    def only_recorded(self) -> list[At]:
+        """What the replay did not say."""
+        return sorted(self._recorded, key=str)
+
+    @property
+    def only_replayed(self) -> list[At]:
+        """What the recording does not have."""
+        return sorted(self._replayed, key=str)
+
+    def _take(self, own: dict, other: dict, topic: Topic, part: str | None, payload: bytes) -> list[Difference]:
+        stamp = stamp_of(payload)
+        at = (topic.name, part, stamp.episode, stamp.step)
+        if at not in other:
+            own[at] = (topic, payload)
+            return []
+        twin = other.pop(at)[1]
+        self.compared += 1
+        if twin == payload and self.on_pair is None:
+            return []
+        pair = decode(topic.type, payload), decode(topic.type, twin)
+        recorded, replayed = pair if own is self._recorded else pair[::-1]
+        if self.on_pair is not None:
+            self.on_pair(topic, part, recorded, replayed)
+        if twin == payload:
+            return []
+        found = list(differences(topic, part, recorded, replayed))
+        self.unequal += 1
+        self.beyond += any(not difference.tolerated for difference in found)
+        self.differences += found[:KEPT - len(self.differences)]
+        return found
+
+
+def differences(topic: Topic, part: str | None, recorded: Message, replayed: Message) -> Iterator[Difference]:
+    """The fields in which two messages differ, whatever is tolerated."""
+    for entry in dataclasses.fields(recorded):
+        old, new = getattr(recorded, entry.name), getattr(replayed, entry.name)
+        if entry.name in IGNORED or np.array_equal(old, new):
+            continue
+        if old is None and entry.name in ADDED.get(type(recorded), ()):  # the recording's format did not have it
+            continue
+        size, tolerated = _size(topic.name, entry.name, old, new)
+        yield Difference(topic.name, part, recorded.episode, recorded.step, entry.name, *_texts(old, new), size,
+                         tolerated)
+
+
+def _size(topic: str, name: str, old: Any, new: Any) -> tuple[float, bool]:
+    """How far two values are apart, and whether that is tolerated."""
+    if any(isinstance(v, (str, bool, list, type(None))) for v in (old, new)) or np.shape(old) != np.shape(new):
+        return float("inf"), False
+    allowed = tolerance_of(topic, name)
+    if allowed.flipped is not None:
+        share = float(np.unpackbits(old ^ new).mean())
+        return share, share <= allowed.flipped
+    apart = np.abs(np.asarray(new, np.float64) - np.asarray(old, np.float64))
+    within = apart <= allowed.absolute + allowed.relative * np.abs(np.asarray(old, np.float64))
+    return float(apart.max(initial=0.0)), bool(within.all())
+
+
+def _texts(old: Any, new: Any) -> tuple[str, str]:
+    """Both values; of arrays the numbers that are furthest apart, with their place."""
+    if not (isinstance(old, np.ndarray) and isinstance(new, np.ndarray)):
+        return _text(old), _text(new)
+    if old.shape != new.shape:
+        return f"shape {list(old.shape)}", f"shape {list(new.shape)}"
+    place = np.unravel_index(np.argmax(np.abs(new.astype(np.float64) - old.astype(np.float64))), old.shape)
+    index = f"[{', '.join(str(i) for i in place)}]"
+    return f"{index} {_text(old[place])}", f"{index} {_text(new[place])}"
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, np.ndarray):
+        return f"{value.dtype} {list(value.shape)}"
+    return f"{value:.9g}" if isinstance(value, (float, np.floating)) else str(value)

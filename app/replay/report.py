@@ -1,0 +1,162 @@
+"""What replays tell: differences, losses, and how far things moved."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from saccade.app.log.check import missing
+from saccade.app.replay.displacement import Moved
+from saccade.app.replay.replay import Outcome, Replay, prepare, replay_here, replay_on_bus
+from saccade.app.run.display import say
+from saccade.services.replayer.core import Keys, Pace, steps_between
+from saccade.shared.bus.topics import FRAME, TOPICS, Topic
+from saccade.shared.config import weights_folder
+from saccade.shared.errors import SaccadeError
+from saccade.shared.log.folder import LOG_NAME
+
+TOLD = 10  # differences that are printed
+PICTURE_NAME, TABLE_NAME = "moved.png", "moved.txt"
+
+
+def replays_of(logs: Sequence[Path], *, into: str, rate: str, start: str | None, end: str | None,
+               episode: int | None, topics: str | None, step: bool, perception: Path | None,
+               values: dict[str, Any]) -> list[Replay]:
+    """What the command line asks for. Raises SaccadeError for what makes no sense."""
+    names = [name.strip() for name in into.split(",") if name.strip()]
+    chosen = None if topics is None else [_topic(name.strip()) for name in topics.split(",")]
+    swap = _weights(perception) | values
+    replays = []
+    for path in logs:
+        log = path / LOG_NAME if path.is_dir() else path
+        which, first, last = _range(log, episode, start, end)
+        replays.append(prepare(log, names, swap, pace=Pace(_rate(rate)), topics=chosen, episode=which, start_step=first,
+                               end_step=last, one_by_one=step))
+    return replays
+
+
+def _rate(text: str) -> float | None:
+    if text == "max":
+        return None
+    try:
+        rate = float(text)
+    except ValueError:
+        rate = 0.0
+    if not 0.1 <= rate <= 100:
+        raise SaccadeError(f"--rate {text}: give a number from 0.1 to 100, or max")
+    return rate
+
+
+def _range(log: Path, episode: int | None, start: str | None, end: str | None) -> tuple[int | None, int, int | None]:
+    """(episode, first step, last step): the two ends in steps, or both in seconds from the start of the log."""
+    ends = [text for text in (start, end) if text is not None]
+    try:
+        if ends and all(text.endswith("s") for text in ends):
+            times_s = [None if text is None else float(text[:-1]) for text in (start, end)]
+            return steps_between(log, FRAME, *times_s, episode=episode)
+        return episode, int(start or 0), None if end is None else int(end)
+    except ValueError as error:
+        raise SaccadeError(f"--start and --end: give two steps such as 3, or two times such as 2.5s, not "
+                           f"{' and '.join(ends)}") from error
+
+
+def _topic(name: str) -> Topic:
+    if name not in TOPICS:
+        raise SaccadeError(f"--topics {name}: choose from {', '.join(TOPICS)}")
+    return TOPICS[name]
+
+
+def _weights(perception: Path | None) -> dict[str, str]:
+    """The configuration of other perception weights: a folder, or the name of one in weights/."""
+    if perception is None:
+        return {}
+    folder = weights_folder(perception)
+    manifest = folder / "manifest.json"
+    if not manifest.is_file():
+        raise SaccadeError(f"--perception {perception}: {manifest} is not there: give a folder with weights")
+    architecture = json.loads(manifest.read_text()).get("architecture", "default")
+    return {"perception.weights": str(folder.resolve()), "perception.architecture": architecture}
+
+
+def replay_all(replays: Sequence[Replay], *, bus: str, out: Path | None, swapped: bool, loops: int,
+               console: Console) -> bool:
+    """Plays the logs, side by side on buses of their own or one after the other in this process, into new folders;
+    prints what came of it. Whether every replay said what was recorded."""
+    folder = out or Path("replays") / time.strftime("%Y%m%d-%H%M%S")
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise SaccadeError(f"{folder} is there already: a replay needs a new folder, give another --out")
+    return all([_pass(replays, bus, folder / str(i) if loops > 1 else folder, swapped, console)
+                for i in range(loops)])
+
+
+def _pass(replays: Sequence[Replay], bus: str, folder: Path, swapped: bool, console: Console) -> bool:
+    folders = [folder if len(replays) == 1 else folder / f"{i}-{r.log.parent.name}" for i, r in enumerate(replays)]
+
+    def one(replay: Replay, place: Path) -> tuple[Outcome, Moved]:
+        moved = Moved()
+        take = moved.take if swapped else None
+        with Keys(enabled=len(replays) == 1) as keys:
+            run = replay_on_bus if bus == "zenoh" else replay_here
+            return run(replay, place, keys, partial(say, console), take), moved
+
+    if bus == "zenoh" and len(replays) > 1:
+        with ThreadPoolExecutor(len(replays)) as pool:
+            results = list(pool.map(one, replays, folders))
+    else:
+        results = [one(replay, place) for replay, place in zip(replays, folders, strict=True)]
+    for replay, place, (outcome, moved) in zip(replays, folders, results, strict=True):
+        tell(replay, outcome, console)
+        if swapped:
+            _tell_moved(moved, place, console)
+        say(console, f"the replay's log is in {place}")
+    return all(outcome.comparison.equal for outcome, _ in results)
+
+
+def tell(replay: Replay, outcome: Outcome, console: Console) -> None:
+    """One replay in a few lines."""
+    comparison, note = outcome.comparison, partial(say, console)
+    count = sum(outcome.played.values())
+    note(f"{replay.log}: {count} messages played into {', '.join(replay.into)}; {comparison.compared} answers "
+         f"compared, {comparison.unequal} differ in a byte, {comparison.beyond} beyond what is tolerated")
+    for difference in [d for d in comparison.differences if not d.tolerated][:TOLD]:
+        note(f"  {difference}")
+    if comparison.beyond > TOLD:
+        note(f"  ... {comparison.beyond} messages in all")
+    for what, only in (("only in the recording", comparison.only_recorded), ("only now", comparison.only_replayed)):
+        for topic, part, episode, step in only[:TOLD]:
+            note(f"  {what}: {topic}{f'/{part}' if part else ''} of step {step} of episode {episode}")
+        if len(only) > TOLD:
+            note(f"  ... {len(only)} messages are {what}")
+    if replay.pace.rate is not None and outcome.late_s > 0.1:
+        note(f"  the services were too slow for {replay.pace.rate:g} x: up to {outcome.late_s:.1f} s behind")
+    _tell_losses(outcome, console)
+
+
+def _tell_losses(outcome: Outcome, console: Console) -> None:
+    report = missing(outcome.log)
+    if outcome.statuses:
+        table = Table("process", "received", "published", "refused", "skipped", "lost on the way")
+        for name, status in sorted(outcome.statuses.items()):
+            table.add_row(name, *(str(n) for n in (status.received, status.published, status.refused, status.skipped,
+                                                   status.gaps)))
+        console.print(table)
+    lost = sum(report.lost.values()) + len(report.absent)
+    say(console, f"loss: {lost} of {report.messages} messages of the replay's log"
+        + (f"; {report.cut}" if report.cut else ""))
+
+
+def _tell_moved(moved: Moved, place: Path, console: Console) -> None:
+    table = moved.table()
+    console.print(table)
+    with (place / TABLE_NAME).open("w") as file:
+        Console(file=file, width=110).print(table)
+    moved.draw(place / PICTURE_NAME)
+    say(console, f"how far things moved: {place / TABLE_NAME}, {place / PICTURE_NAME}")

@@ -1,0 +1,234 @@
+"""A whole agent on this machine: the bus, one process per service, and their end."""
+
+from __future__ import annotations
+
+import queue
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from saccade.app.run.supervisor import Process, Supervisor
+from saccade.services.simulator.objects import names_of
+from saccade.shared.bus.messages import Message, Result
+from saccade.shared.bus.sequences import Sequences
+from saccade.shared.bus.topics import PLAN, RESULT, STATUS, Topic
+from saccade.shared.bus.transport import Bus, ZenohBus, free_endpoint
+from saccade.shared.bus.wire import MessageError, decode
+from saccade.shared.config import Config
+from saccade.shared.errors import SaccadeError
+from saccade.shared.log.folder import CONFIG_NAME, LOG_NAME, LOGS_NAME
+from saccade.shared.loop.main import READY_STATES
+
+OnMessage = Callable[[Topic, str | None, Message], None]
+FOLLOWED = (STATUS, PLAN, RESULT)  # by which the launcher knows how far a run is
+READY_S = 120.0  # loading weights on a busy machine takes its time
+POLL_S = 0.2
+QUIET_S = 2.0  # without news a result is asked for: it may have been published while the router was away
+WORKED_OFF_S = 10.0  # without news after the last frame, where nobody judges: its plan will not come any more
+JUDGE = "evaluator"
+
+# The router, then the others in the order of the data.
+ROUTER, *SERVICES = PROCESSES = tuple(Process(name, f"saccade.services.{name}") for name in (
+    "router", "simulator", "perception", "belief", "planner", JUDGE, "recorder"))
+
+
+def launch(config: Config, run_dir: Path, on_message: OnMessage | None = None,
+           processes: Sequence[Process] = PROCESSES, say: Callable[[str], None] | None = None,
+           topics: Sequence[Topic] | None = None) -> list[Result]:
+    """`launched` without a look at what stays when the run is over."""
+    with launched(config, run_dir, on_message, processes, say, topics) as ended:
+        return ended.results
+
+
+@dataclass(frozen=True)
+class Ended:
+    """A run that is over: its results, and whether a process that looks on is still there."""
+
+    results: list[Result]
+    runs: Callable[[str], bool]
+
+
+@contextmanager
+def launched(config: Config, run_dir: Path, on_message: OnMessage | None = None,
+             processes: Sequence[Process] = PROCESSES, say: Callable[[str], None] | None = None,
+             topics: Sequence[Topic] | None = None) -> Iterator[Ended]:
+    """Runs all episodes, one process per service, and gives their results in order, none where nobody judges; the log
+    is `run_dir`/run.mcap. A run ends when its source has finished and what it sent has been worked off. Who looks on
+    stays until the context is left.
+
+    `on_message(topic, part, message)` sees every valid message once, on the caller's thread, of these topics or of all:
+    what nobody looks at costs nothing. `say(text)` is told of services that died and were started again, and of
+    those that hang. The first process is the router, the second the source. Raises SaccadeError, naming the service, if
+    one says why it cannot run, dies too often or is not ready within READY_S.
+    """
+    config = resolve(config, processes)
+    wanted = topics if on_message else ()
+    with running(config, run_dir, processes, wanted if wanted is None else {*wanted, *FOLLOWED}, say) as graph:
+        results = follow(graph, processes, on_message)
+        graph.supervisor.stop(onlookers=False)
+        _drain(graph.messages, on_message)
+        for complaint in graph.supervisor.complaints():  # what went wrong beside the results, such as a full disk
+            print(f"saccade: {complaint}", file=sys.stderr)
+        yield Ended(results, graph.supervisor.runs)
+
+
+@dataclass(frozen=True)
+class Graph:
+    """Processes that run, and a place on their bus. `messages`: (topic, part, message) as they arrive, each once, and
+    None when nothing did; iterating watches over the processes."""
+
+    bus: Bus
+    supervisor: Supervisor
+    messages: Iterator[tuple[Topic, str | None, Message] | None]
+
+
+@contextmanager
+def running(config: Config, run_dir: Path, processes: Sequence[Process], topics: Iterable[Topic] | None,
+            say: Callable[[str], None] | None = None) -> Iterator[Graph]:
+    """The processes of a resolved configuration in a new run folder, ended when the context is left. The first is the
+    router, and is there before the others. `topics`: which messages are wanted, None for all."""
+    _prepare(run_dir)
+    config.save(run_dir / CONFIG_NAME)
+    arrived: queue.SimpleQueue = queue.SimpleQueue()
+    with ExitStack() as stack:
+        stack.enter_context(_terminable())
+        supervisor = Supervisor(run_dir, say or (lambda text: print(f"saccade: {text}", file=sys.stderr)))
+        stack.callback(supervisor.stop)
+        supervisor.start(processes[0])
+        bus = ZenohBus(config.bus.endpoint, world=config.bus.world)
+        stack.callback(bus.close)
+        bus.subscribe(topics, lambda *item: arrived.put(item))
+        stream = messages(arrived, bus, supervisor, config.run or run_dir.name)
+        _await_router(stream, processes[0])
+        for process in processes[1:]:
+            supervisor.start(process)
+        yield Graph(bus, supervisor, stream)
+
+
+def resolve(config: Config, processes: Sequence[Process] = PROCESSES) -> Config:
+    """The configuration as the processes read it: objects named, a free port, who must be ready first."""
+    names = config.scene.names or names_of(config.scene.objects)
+    return config.with_values({"bus.endpoint": free_endpoint(config.bus.endpoint), "scene.names": list(names),
+                               "bus.wait_for": [process.name for process in processes[2:] if not process.onlooker]})
+
+
+def _prepare(run_dir: Path) -> None:
+    if (run_dir / LOG_NAME).exists():
+        raise SaccadeError(f"run folder {run_dir} already holds a log; choose another, or move it away")
+    try:
+        (run_dir / LOGS_NAME).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise SaccadeError(f"run folder {run_dir} cannot be made: {error.strerror}") from error
+
+
+def messages(arrived: queue.SimpleQueue, bus: Bus, supervisor: Supervisor, run: str) -> Iterator:
+    """(topic, part, message) as they arrive, each once, and None when nothing did."""
+    sequences, looked_s, news_s = Sequences(), time.monotonic(), time.monotonic()
+    while True:
+        now_s = time.monotonic()
+        if now_s - looked_s >= POLL_S:
+            looked_s = now_s
+            supervisor.check()
+        if now_s - news_s >= QUIET_S and not supervisor.stopped:
+            news_s = now_s
+            for topic, part, payload, *_ in bus.recall((RESULT,), (run, 0, 0)):
+                arrived.put((topic, part, payload))
+        item = None
+        with suppress(queue.Empty, MessageError):  # whoever subscribes to an invalid message counts it
+            topic, part, payload = arrived.get(timeout=POLL_S)
+            message = decode(topic.type, payload)
+            if topic == STATUS:
+                supervisor.heard(part, message.state)
+            if sequences.take(topic, part, message) is not None:
+                item = (topic, part, message)
+                news_s = news_s if topic == STATUS else now_s
+        yield item
+
+
+def _await_router(messages: Iterator, router: Process) -> None:
+    deadline_s = time.monotonic() + READY_S
+    for item in messages:
+        if item is not None and item[0] == STATUS and item[1] == router.name and item[2].state in READY_STATES:
+            return
+        if time.monotonic() > deadline_s:
+            raise SaccadeError(f"{router.name}: not ready after {READY_S:.0f} s; see {LOGS_NAME}/")
+
+
+def follow(graph: Graph, processes: Sequence[Process], on_message: OnMessage | None) -> list[Result]:
+    starting = {process.name for process in processes[1:] if not process.onlooker}
+    course = _Course(processes[1].name, judged=JUDGE in starting)
+    over_s, deadline_s = None, time.monotonic() + READY_S
+    for item in graph.messages:
+        if starting and time.monotonic() > deadline_s:
+            raise SaccadeError(f"{', '.join(sorted(starting))}: not ready after {READY_S:.0f} s; see {LOGS_NAME}/")
+        over_s = (over_s or time.monotonic()) if course.over else None
+        if over_s is not None and graph.supervisor.settled(over_s):
+            break
+        if item is None:
+            continue
+        topic, part, message = item
+        if on_message is not None:
+            on_message(topic, part, message)
+        course.take(topic, part, message)
+        if topic == STATUS and message.state in READY_STATES:
+            starting.discard(part)
+    return [course.results[episode] for episode in sorted(course.results)]
+
+
+class _Course:
+    """How far a run has come."""
+
+    def __init__(self, source: str, *, judged: bool) -> None:
+        self.results: dict[int, Result] = {}
+        self._source, self._judged = source, judged
+        self._end: tuple[int, int] | None = None  # episode and step that the source published last
+        self._planned, self._news_s = (-1, -1), time.monotonic()
+
+    def take(self, topic: Topic, part: str | None, message: Message) -> None:
+        """Any message."""
+        if topic.in_step:
+            self._news_s = time.monotonic()
+        if topic == RESULT:
+            self.results[message.episode] = message
+        elif topic == PLAN:
+            self._planned = max(self._planned, (message.episode, message.step))
+        elif topic == STATUS and part == self._source and message.state == "finished":
+            self._end = (message.episode, message.step)
+
+    @property
+    def over(self) -> bool:
+        """Whether the source has finished and every episode has its result; where nobody judges, the last frame its
+        plan."""
+        if self._end is None:
+            return False
+        if self._judged:
+            return len(self.results) > self._end[0]
+        return self._planned >= self._end or time.monotonic() - self._news_s > WORKED_OFF_S
+
+
+def _drain(messages: Iterator, on_message: OnMessage | None) -> None:
+    """What was still on its way when the services were stopped."""
+    while on_message is not None and (item := next(messages)) is not None:
+        on_message(*item)
+
+
+@contextmanager
+def _terminable() -> Iterator[None]:
+    """SIGTERM ends the run as Ctrl-C does."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def interrupt(_number: int, _frame: object) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)

@@ -1,0 +1,185 @@
+"""`saccade run`: one run of the agent, logged whole; on the bus, or in this one process."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+
+from saccade.app.run.display import Display, say
+from saccade.app.run.launch import launched
+from saccade.app.run.registry import DEFAULT_WORLD, agent_of, agent_processes, local_pairs, world_of
+from saccade.app.run.summary import summary
+from saccade.app.run.supervisor import VIEWER
+from saccade.services.camera.core import build as build_camera
+from saccade.services.camera.sources import absolute, webcam_number
+from saccade.services.recorder.core import describe
+from saccade.services.simulator.core import names_in_use
+from saccade.services.viewer.server import binary, url_of, with_free_ports
+from saccade.shared.bus.messages import Message, Result
+from saccade.shared.bus.topics import Topic
+from saccade.shared.config import Config
+from saccade.shared.errors import SaccadeError
+from saccade.shared.log.folder import CONFIG_NAME, LOG_NAME
+from saccade.shared.log.recording import RecordingStopped, RunLog
+from saccade.shared.loop.local import run_local
+
+MANIFEST_NAME = "manifest.json"
+
+
+@dataclass(frozen=True)
+class Finished:
+    """A run that is over: its resolved configuration, its folder, how its episodes ended, and whether its viewer still
+    shows it."""
+
+    config: Config
+    folder: Path
+    results: list[Result]
+    is_viewed: Callable[[], bool]
+
+
+def run(config: Config, *, agent: str, out: Path | None, plain: bool, console: Console | None = None,
+        world: str = DEFAULT_WORLD, view: bool = False, after: Callable[[Finished], None] | None = None) -> Finished:
+    """Runs all episodes of a configuration into a new folder; prints how they ended and where it is. Ctrl-C is one of
+    the ends that the run of a real camera has. With `view` the run can be looked at. `after` is called when the run is
+    over and its viewer still there; a run that was interrupted has none."""
+    console, place = console or Console(), world_of(world)
+    config = resolve(in_world(config, world))
+    require_weights(agent, config)
+    if view:
+        config = to_be_viewed(config)
+    processes = agent_processes(agent, world, view=view) if config.bus.kind == "zenoh" else ()
+    folder = _new_folder(out or Path("runs") / f"{time.strftime('%Y%m%d-%H%M%S')}-{config.seed}")
+    ended = None  # of a run that was interrupted nothing stays to be looked at
+    with ExitStack() as stack:
+        with Display(console, plain=plain, judged=config.scene.goal_view_is_known,
+                     camera=place.source if place.live else None) as display:
+            if view:
+                display.say(f"look at {url_of(config.viewer)}")
+            try:
+                if processes:
+                    ended = stack.enter_context(
+                        launched(config, folder, display.take, processes, display.say, display.topics))
+                    results = ended.results
+                else:
+                    results = run_here(config, agent, folder, display, world)
+            except KeyboardInterrupt:
+                if not place.live or display.progress.at is None:
+                    raise
+                results = []
+        for text in summary(config, results, display.progress):
+            say(console, text)
+        finished = Finished(config, folder, results, lambda: ended is not None and ended.runs(VIEWER.name))
+        if after is not None:
+            after(finished)
+    return finished
+
+
+def to_be_viewed(config: Config) -> Config:
+    """The configuration with the ports that its viewer will have. Raises SaccadeError where it can have none."""
+    if config.bus.kind != "zenoh":
+        raise SaccadeError("--view is for services on the bus: leave `--bus local` out, or look at the log with "
+                           "`saccade view`")
+    binary()
+    return with_free_ports(config)
+
+
+def in_world(config: Config, world: str) -> Config:
+    """The configuration as that world has it. Raises SaccadeError for one that it has no use for, and for a camera that
+    cannot be: before anything starts."""
+    scene, camera = config.scene, config.camera
+    if not world_of(world).live:
+        if camera.source is not None:
+            raise SaccadeError("camera.source is for a real camera: add `--world camera`")
+        return config
+    if scene.file or scene.scene or scene.n_objects or scene.count > 1:
+        raise SaccadeError(f"scenes are the simulator's: with `--world {world}` leave --scenes, --scene, --n-objects "
+                           "and --count out")
+    config = config.with_values({"scene.explore": scene.explore or scene.goal_image is None,
+                                 "bus.live": config.bus.kind == "zenoh"})
+    if camera.source is None or webcam_number(camera.source) is None:  # a webcam would be switched on and off
+        build_camera(config)
+    return config
+
+
+def resolve(config: Config) -> Config:
+    """The configuration with its objects named and its paths absolute."""
+    scene = config.scene
+    paths = {"scene.file": scene.file, "scene.goal_image": scene.goal_image,
+             "camera.poses": config.camera.poses, "perception.weights": config.perception.weights}
+    source = {} if config.camera.source is None else {"camera.source": absolute(config.camera.source)}
+    return config.with_values({"scene.names": list(names_in_use(scene))} | source |
+                              {key: path.resolve() for key, path in paths.items() if path is not None})
+
+
+def require_weights(agent: str, config: Config) -> None:
+    """Raises SaccadeError where the agent's weights are missing: before any process starts, and without torch."""
+    if agent_of(agent).weights and not (config.weights / MANIFEST_NAME).is_file():
+        from saccade.shared.model.weights import Weights
+
+        Weights(config.weights)
+
+
+def run_here(config: Config, agent: str, folder: Path, display: Display, world: str = DEFAULT_WORLD) -> list[Result]:
+    """The run within this process, logged as on the bus. A log that can take no more does not stop it."""
+    pairs = local_pairs(agent, config, world)
+    source = pairs[0][1]
+    folder.mkdir(parents=True, exist_ok=True)
+    config.save(folder / CONFIG_NAME)
+    log = RunLog(folder / LOG_NAME, world=config.bus.world, configuration=config.model_dump_json(indent=2),
+                 metadata=describe(config, folder.name))
+
+    def on_message(topic: Topic, part: str | None, message: Message, payload: bytes | None) -> None:
+        end_if_interrupted()
+        try:
+            log.write(topic, part, payload, sequence=message.seq)
+        except RecordingStopped as error:  # once; what follows is not logged
+            print(f"saccade: {error}", file=sys.stderr)
+        display.take(topic, part, message)
+
+    display.note("\n".join(getattr(source, "notes", ())))
+    with _interrupted_between_messages() as end_if_interrupted:
+        try:
+            run_local(pairs, config.scene.names, folder.name, on_message=on_message, encoded=True)
+        finally:
+            log.close()
+            if left_out := getattr(source, "skipped", 0):
+                display.note(f"{left_out} images without a pose were left out")
+    return display.progress.results
+
+
+@contextmanager
+def _interrupted_between_messages() -> Iterator[Callable[[], None]]:
+    """Ctrl-C takes effect where what is yielded is called: within a write it would tear the log. A second one, at
+    once."""
+    interrupted = threading.Event()
+
+    def raise_if_interrupted() -> None:
+        if interrupted.is_set():
+            raise KeyboardInterrupt
+
+    def on_interrupt(_number: int, _frame: object) -> None:
+        raise_if_interrupted()
+        interrupted.set()
+
+    if threading.current_thread() is not threading.main_thread():
+        yield raise_if_interrupted
+        return
+    before = signal.signal(signal.SIGINT, on_interrupt)
+    try:
+        yield raise_if_interrupted
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _new_folder(folder: Path) -> Path:
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise SaccadeError(f"{folder} is there already: a run needs a new folder, give another --out")
+    return folder

@@ -1,0 +1,41 @@
+"""What pyproject.toml cannot say: the repository's root is the package `saccade`, its rooms are derived from the
+folders, and a distribution carries the commit that it was built from."""
+
+import os
+import subprocess
+from pathlib import Path
+
+from setuptools import find_packages, setup
+from setuptools.command.build_py import build_py
+from setuptools.command.sdist import sdist
+
+ROOMS = ("app", "deploy", "services", "shared", "training")
+COMMIT = Path("COMMIT")  # in an sdist, which has no history
+
+
+def commit() -> str:
+    if COMMIT.is_file():
+        return COMMIT.read_text().strip()
+    try:
+        done = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, timeout=10, check=True)
+        return done.stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return os.environ.get("SACCADE_COMMIT", "unknown")
+
+
+class BuildWithCommit(build_py):
+    def run(self) -> None:
+        super().run()
+        if not self.editable_mode:
+            Path(self.build_lib, "saccade", COMMIT).write_text(commit() + "\n")
+
+
+class SdistWithCommit(sdist):
+    def make_release_tree(self, base_dir: str, files: list[str]) -> None:
+        super().make_release_tree(base_dir, files)
+        Path(base_dir, COMMIT).write_text(commit() + "\n")
+
+
+setup(package_dir={"saccade": "."},
+      packages=["saccade", *(f"saccade.{name}" for name in find_packages(include=[f"{room}*" for room in ROOMS]))],
+      cmdclass={"build_py": BuildWithCommit, "sdist": SdistWithCommit})

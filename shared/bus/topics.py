@@ -1,0 +1,60 @@
+"""The registry: every topic, its key, its message type, who may be late for it. No key stands anywhere else."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+from saccade.shared.bus import messages as m
+from saccade.shared.errors import SaccadeError
+
+ROOT = "saccade"
+
+
+@dataclass(frozen=True)
+class Topic:
+    """One kind of publication. `parts`: one key per object (or service) below the topic's. `latched`: one value an
+    episode, kept for every later step. `in_step`: published once per step (and part), so that gaps can be told."""
+
+    name: str
+    type: type[m.Message]
+    parts: bool = False
+    latched: bool = False
+    in_step: bool = True
+
+    def key(self, world: str, part: str | None = None) -> str:
+        """The key expression `saccade/<world>/<topic>[/<part>]`; without `part`, of all parts."""
+        return f"{ROOT}/{world}/{self.name}" + (f"/{part or '*'}" if self.parts else "")
+
+
+@dataclass(frozen=True)
+class Output:
+    """A message on its way out; `part` names the object where the topic has parts."""
+
+    topic: Topic
+    message: m.Message
+    part: str | None = None
+
+
+FRAME = Topic("frame", m.Frame)
+GOAL = Topic("goal", m.Goal, latched=True)
+PERCEPT = Topic("percept", m.Percept, parts=True)
+GOAL_PERCEPT = Topic("goal_percept", m.Percept, parts=True, latched=True)
+BELIEF = Topic("belief", m.Belief, parts=True)
+PLAN = Topic("plan", m.Plan)
+ACTION = Topic("action", m.Action)
+TRUTH = Topic("truth", m.Truth)
+RESULT = Topic("result", m.Result, latched=True)
+STATUS = Topic("status", m.Status, parts=True, in_step=False)
+
+TOPICS: dict[str, Topic] = {topic.name: topic for topic in (
+    FRAME, GOAL, PERCEPT, GOAL_PERCEPT, BELIEF, PLAN, ACTION, TRUTH, RESULT, STATUS)}
+
+
+def parse_key(key: str) -> tuple[str, Topic, str | None]:
+    """(world, topic, part) of a key. Raises SaccadeError for a key that is none of ours."""
+    match = re.fullmatch(rf"{ROOT}/([^/*]+)/([^/*]+)(?:/([^/*]+))?", key)
+    topic = TOPICS.get(match[2]) if match else None
+    if match is None or topic is None or topic.parts != (match[3] is not None):
+        raise SaccadeError(f"key {key!r} is not one of Saccade's topics: {', '.join(TOPICS)}")
+    return match[1], topic, match[3]

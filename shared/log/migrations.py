@@ -1,0 +1,71 @@
+"""Logs outlive their format: one small change from each format to the next, oldest first.
+
+A change sees a message's fields as they lie in the MessagePack map (arrays are still extension types) and returns them
+as the next format has them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgpack
+
+from saccade.shared.bus import messages as m
+from saccade.shared.bus.topics import Topic
+from saccade.shared.errors import SaccadeError
+
+Fields = dict[str, Any]
+Change = Callable[[Topic, str | None, Fields], Fields]
+
+OLDEST = 1  # of logs that do not say
+ADDED = {m.Percept: ("mask_bits",), m.Plan: ("best_eyes_m", "best_g")}  # fields that older logs do not have: None
+
+
+def count_in_episodes() -> Change:
+    """1 to 2: sequence numbers count from 0 in every episode, not through the run."""
+    first: dict[tuple[str, str | None, str, int], int] = {}
+
+    def change(topic: Topic, part: str | None, fields: Fields) -> Fields:
+        if not topic.in_step:
+            return fields
+        start = first.setdefault((topic.name, part, fields["run"], fields["episode"]), fields["seq"])
+        return fields | {"seq": fields["seq"] - start}
+
+    return change
+
+
+def with_masks_and_candidates() -> Change:
+    """2 to 3: percepts say where in the image they are from, plans what they were chosen from."""
+    def change(topic: Topic, part: str | None, fields: Fields) -> Fields:
+        if topic.type not in ADDED:
+            return fields
+        return fields | {"version": 2} | dict.fromkeys(ADDED[topic.type])
+
+    return change
+
+
+CHANGES: tuple[Callable[[], Change], ...] = (count_in_episodes, with_masks_and_candidates)
+FORMAT = OLDEST + len(CHANGES)
+
+
+class Migration:
+    """From the format of a log to today's. Raises SaccadeError for a format that is not known yet."""
+
+    def __init__(self, version: int, path: Path) -> None:
+        if not OLDEST <= version <= FORMAT:
+            raise SaccadeError(f"log {path} has format {version}, this Saccade reads {OLDEST} to {FORMAT}: update it")
+        self._changes = [make() for make in CHANGES[version - OLDEST:]]
+
+    def __call__(self, topic: Topic, part: str | None, payload: bytes) -> bytes:
+        """The wire bytes of today's format; what is no message stays as it is."""
+        if not self._changes:
+            return payload
+        try:
+            fields = msgpack.unpackb(payload)
+            for change in self._changes:
+                fields = change(topic, part, fields)
+            return msgpack.packb(fields)
+        except Exception:  # msgpack raises many kinds for bytes that are not msgpack; whoever decodes it says so
+            return payload

@@ -1,0 +1,26 @@
+"""Which state of the source something was made with."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+
+from saccade.shared.config import PACKAGE
+
+WRITTEN = ("results", "docs")
+
+
+def commit() -> str:
+    """The commit of the source, with "-dirty" where it was changed since. Results and documents may change: they are
+    what runs write. Outside a checkout what SACCADE_COMMIT says, or "unknown"."""
+    try:
+        head = _git("rev-parse", "HEAD")
+        changed = _git("status", "--porcelain", "--untracked-files=no", "--", ".", *(f":!{room}" for room in WRITTEN))
+    except (OSError, subprocess.SubprocessError):
+        return os.environ.get("SACCADE_COMMIT", "unknown")
+    return head + "-dirty" * bool(changed)
+
+
+def _git(*arguments: str) -> str:
+    command = ["git", "-C", str(PACKAGE), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=10, check=True).stdout.strip()

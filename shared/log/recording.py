@@ -1,0 +1,192 @@
+"""Writing the log of a run as MCAP: the wire bytes as they were. A crash loses little of it."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import time
+import typing
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+from mcap.data_stream import RecordBuilder
+from mcap.records import DataEnd, Footer, Metadata
+from mcap.writer import MCAP0_MAGIC, Writer
+
+from saccade.shared.bus.messages import ArraySpec, Message, field_types
+from saccade.shared.bus.topics import Topic
+from saccade.shared.bus.wire import ARRAY_EXTENSION
+from saccade.shared.errors import SaccadeError
+from saccade.shared.log.migrations import FORMAT
+
+FLUSH_S = 0.4  # a chunk is closed this often: what a killed recorder may lose
+CONFIGURATION = "config.json"
+ENDED_EARLY = "ended_early"
+LOG = "log"  # metadata about the log itself: its format
+CUT = "cut"  # metadata of a log that does not begin with step 0, or is a part of another: which steps it has
+
+
+class RecordingStopped(SaccadeError):
+    """The log can take no more; what was recorded stays readable."""
+
+
+class RunLog:
+    """Writes one run's log. `metadata`: names to maps of text, such as versions and weights' hashes.
+
+    Raises SaccadeError if the file cannot be created or is there already; RecordingStopped, once, when the
+    disk is full or the log was removed.
+    """
+
+    def __init__(self, path: Path, *, world: str, configuration: str = "{}",
+                 metadata: Mapping[str, Mapping[str, str]] | None = None) -> None:
+        self.path, self.messages, self._world = path, 0, world
+        self._channels: dict[str, int] = {}
+        self._schemas: dict[str, int] = {}
+        self._flushed_s = time.monotonic()
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = _WholeRecords(path)
+        except OSError as error:
+            raise SaccadeError(f"log {path} cannot be written: {error.strerror}") from error
+        self._writer: Writer | None = Writer(self._file)
+        self._guarded(self._start, configuration, metadata or {})
+
+    def write(self, topic: Topic, part: str | None, payload: bytes, *, sequence: int = 0,
+              log_time_ns: int | None = None) -> None:
+        """Appends wire bytes, at the time of their arrival (now unless given)."""
+        if self._writer is not None:
+            now_ns = time.time_ns() if log_time_ns is None else log_time_ns
+            self._guarded(self._add, topic, part, payload, sequence, now_ns)
+            self.flush_if_due()
+
+    def flush_if_due(self) -> None:
+        """To be called at least every FLUSH_S seconds while nothing is written."""
+        if time.monotonic() - self._flushed_s >= FLUSH_S:
+            self.flush()
+
+    def flush(self) -> None:
+        """Brings to the disk what was written so far."""
+        if self._writer is not None:
+            self._flushed_s = time.monotonic()
+            self._guarded(lambda: (self._writer.flush(), self._file.sync()))
+            self._stop_if_gone()
+
+    def close(self) -> None:
+        """Writes the index and closes the file."""
+        if self._writer is not None:
+            self._guarded(self._writer.finish)
+            self._guarded(self._file.sync)
+            self._stop_if_gone()
+            self._writer = None
+        self._file.close()
+
+    def _guarded(self, action, *arguments) -> None:
+        try:
+            action(*arguments)
+        except OSError as error:
+            self._writer = None
+            self._file.end_early(error.strerror or str(error))
+            self._file.close()
+            raise RecordingStopped(f"recording stopped ({error.strerror}): {self.path} keeps what was recorded; "
+                                   "free some space before the next run") from error
+
+    def _stop_if_gone(self) -> None:
+        """The file of a removed folder can be written on and on, and is nowhere once it is closed."""
+        if self._file.is_gone():
+            self._writer = None
+            self._file.close()
+            what = "file" if self.path.parent.is_dir() else "folder"
+            raise RecordingStopped(f"recording stopped: the log's {what} is gone ({self.path}): what is recorded from "
+                                   "now on is lost; leave the folder of a run where it is until the run has ended")
+
+    def _start(self, configuration: str, metadata: Mapping[str, Mapping[str, str]]) -> None:
+        self._writer.start()
+        for name, values in {LOG: {"format": FORMAT}, **metadata}.items():
+            self._writer.add_metadata(name, {str(k): str(v) for k, v in values.items()})
+        now = time.time_ns()
+        self._writer.add_attachment(now, now, CONFIGURATION, "application/json", configuration.encode())
+
+    def _add(self, topic: Topic, part: str | None, payload: bytes, sequence: int, log_time_ns: int) -> None:
+        key = topic.key(self._world, part)
+        if key not in self._channels:
+            name = topic.type.__name__
+            if name not in self._schemas:
+                text = json.dumps(json_schema(topic.type), sort_keys=True).encode()
+                self._schemas[name] = self._writer.register_schema(name, "jsonschema", text)
+            self._channels[key] = self._writer.register_channel(key, "msgpack", self._schemas[name])
+        self._writer.add_message(self._channels[key], log_time_ns, payload, log_time_ns, sequence % 2 ** 32)
+        self.messages += 1
+
+
+class _WholeRecords:
+    """The file below mcap's Writer, which writes whole records only: of one that does not fit nothing is left."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path.absolute()
+        self._raw = path.open("xb", buffering=0)  # a log is never written over
+        self._end = 0
+
+    def write(self, data: bytes) -> int:
+        rest = memoryview(data)
+        while rest:
+            rest = rest[self._raw.write(rest):]
+        self._end += len(data)
+        return len(data)
+
+    def tell(self) -> int:
+        return self._end
+
+    def flush(self) -> None:
+        """Nothing is held back."""
+
+    def sync(self) -> None:
+        os.fdatasync(self._raw.fileno())
+
+    def is_gone(self) -> bool:
+        """Whether it has been removed; one that was moved or has another name is still there."""
+        held = os.fstat(self._raw.fileno())
+        with contextlib.suppress(OSError):
+            if os.path.samestat(held, os.stat(self._path)):
+                return False
+        return held.st_nlink == 0
+
+    def end_early(self, reason: str) -> None:
+        """Cuts off a half-written record and, where there is room, ends the file as MCAP asks, without an index."""
+        ending = RecordBuilder()
+        Metadata(name=ENDED_EARLY, metadata={"reason": reason}).write(ending)
+        DataEnd(0).write(ending)
+        Footer(summary_start=0, summary_offset_start=0, summary_crc=0).write(ending)
+        try:
+            self._raw.truncate(self._end)
+            self._raw.seek(self._end)
+            self.write(ending.end() + MCAP0_MAGIC)
+        except OSError:
+            self._raw.truncate(self._end)
+
+    def close(self) -> None:
+        self._raw.close()
+
+
+def json_schema(message_type: type[Message]) -> dict[str, Any]:
+    """JSON Schema of a message's MessagePack map. Arrays are extension type 1; their dtype and shape stand beside."""
+    fields = field_types(message_type)
+    properties = {"type": {"const": message_type.__name__}, "version": {"const": message_type.VERSION}}
+    properties |= {name: _field_schema(hint) for name, hint in fields.items()}
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": message_type.__name__,
+            "description": (message_type.__doc__ or "").strip(), "type": "object", "properties": properties,
+            "required": ["type", "version", *fields], "additionalProperties": False}
+
+
+def _field_schema(hint: Any) -> dict[str, Any]:
+    if typing.get_origin(hint) is Annotated:
+        spec: ArraySpec = typing.get_args(hint)[1]
+        return {"type": "array", "description": f"{spec.dtype} {list(spec.shape)}, row-major, MessagePack extension",
+                "x-extension": ARRAY_EXTENSION, "x-dtype": spec.dtype, "x-shape": list(spec.shape)}
+    if hint == list[str]:
+        return {"type": "array", "items": {"type": "string"}}
+    simple = {str: "string", int: "integer", float: "number", bool: "boolean", type(None): "null"}
+    if hint in simple:
+        return {"type": simple[hint]}
+    return {"anyOf": [_field_schema(h) for h in typing.get_args(hint)]}

@@ -1,0 +1,62 @@
+"""The runner that drives the same cores in one process: for benchmarks, and as the yardstick of what the bus costs."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+
+from saccade.shared.bus.messages import Message
+from saccade.shared.bus.topics import Output, Topic
+from saccade.shared.bus.wire import encode
+from saccade.shared.errors import SaccadeError
+from saccade.shared.loop.main import WAITS
+from saccade.shared.loop.service import Core, Service
+from saccade.shared.loop.stepper import Stepper, settle
+
+OnMessage = Callable[[Topic, str | None, Message, bytes | None], None]
+OnStep = Callable[[str, float], None]
+
+
+def run_local(pairs: Sequence[tuple[Service, Core]], parts: tuple[str, ...], run_id: str,
+              episodes: Iterable[int] | None = None, on_message: OnMessage | None = None, *, encoded: bool = False,
+              on_step: OnStep | None = None) -> None:
+    """Runs the cores in this process: those episodes of the source (the core with `episodes`), in rising order; or all.
+
+    `on_message(topic, part, message, payload)` sees every message in the order of publication; payload is its wire
+    bytes if `encoded`, else None, and messages pass as they are. A source that goes by time is not hurried: its next
+    frame comes when the one before it has been worked off. `on_step(service, milliseconds)` is told what each
+    step of a core took. Raises SaccadeError if a step lacks an input for good.
+    """
+    sources = [Stepper(s, c, parts, source=True) for s, c in pairs if hasattr(c, "episodes")]
+    if len(sources) != 1:
+        raise SaccadeError(f"a run needs one source, not {len(sources)}: {', '.join(s.name for s, _ in pairs)}")
+    source = sources[0]
+    steppers = [source if c is source.core else Stepper(s, c, parts) for s, c in pairs]
+    for episode in range(source.core.episodes) if episodes is None else episodes:
+        waiting = deque(source.begin(run_id, episode))
+        while waiting or (source.timed and not source.episode_done):
+            if not waiting:  # the frame before it has been worked off
+                waiting.extend(source.tick())
+                continue
+            output = waiting.popleft()
+            message = settle(output.message)
+            if on_message is not None:
+                on_message(output.topic, output.part, message, encode(message) if encoded else None)
+            for stepper in steppers:
+                if output.topic not in stepper.service.inputs:
+                    continue
+                stepper.offer(output.topic, output.part, message)
+                while (outputs := _advance(stepper, on_step)) is not None:
+                    waiting.extend(outputs)
+        if not source.episode_done:
+            lacks = [f"{s.service.name} {WAITS}{', '.join(s.waits_for())}" for s in steppers if s.waits_for()]
+            raise SaccadeError(f"episode {episode} came to a halt: {'; '.join(lacks) or 'nobody has anything to do'}")
+
+
+def _advance(stepper: Stepper, on_step: OnStep | None) -> list[Output] | None:
+    start = time.perf_counter()
+    outputs = stepper.advance()
+    if outputs is not None and on_step is not None:
+        on_step(stepper.service.name, (time.perf_counter() - start) * 1e3)
+    return outputs

@@ -1,0 +1,290 @@
+"""The one main loop of every service."""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
+
+from saccade.shared.bus.messages import Message
+from saccade.shared.bus.outbox import Outbox
+from saccade.shared.bus.sequences import Sequences
+from saccade.shared.bus.topics import STATUS, Output, Topic
+from saccade.shared.bus.transport import Bus, ZenohBus
+from saccade.shared.bus.wire import MessageError, decode, encode, stamp_of
+from saccade.shared.config import Config
+from saccade.shared.errors import SaccadeError
+from saccade.shared.loop.process import DRAIN_S, Health, Heartbeat, Inbox, run_process
+from saccade.shared.loop.replicas import JOIN_S, MEET_S, Share, alone_on
+from saccade.shared.loop.service import Core, Service
+from saccade.shared.loop.stepper import Stepper
+from saccade.shared.loop.ticker import Ticker
+
+READY_STATES = ("ready", "busy")
+IDLE_S = 1.0  # after so long without a message a service asks for what it lacks, and says so
+WAITS = "waits for "
+
+
+def main(service: Service, build: Callable[[Config], Core], *, source: bool = False,
+         parts: tuple[str, ...] | None = None, argv: Sequence[str] | None = None) -> None:
+    """A service's whole process: `--config RUN/config.json`, then messages in, messages out, until SIGTERM.
+
+    `parts` are the objects' names, those of the configuration unless given. A `source` begins its episodes itself,
+    the first once every service in `bus.wait_for` is ready; one that goes by time publishes a frame a period. Bad
+    input ends the process with one line and code 2.
+    """
+
+    def work(config: Config, folder: Path, inbox: Inbox) -> None:
+        names = parts if parts is not None else config.names
+        core = build(config)
+        bus = ZenohBus(config.bus.endpoint, world=config.bus.world)
+        try:
+            serve(service, core, bus, names, run=config.run or folder.name, source=source,
+                  wait_for=config.bus.wait_for, inbox=inbox, live=config.bus.live, first_step=config.bus.first_step)
+        finally:
+            bus.close()
+
+    run_process(service.name, work, argv=argv)
+
+
+def serve(service: Service, core: Core, bus: Bus, parts: tuple[str, ...], *, run: str, source: bool = False,
+          wait_for: tuple[str, ...] = (), inbox: Inbox | None = None, live: bool = False,
+          first_step: int = 0) -> Health:
+    """Runs a core on a bus until `inbox` is stopped; returns what it counted.
+
+    What was published before this service was there, or while it or the router was away, is asked for: at the start,
+    and whenever nothing comes. So a service that is started again folds the episode so far and goes on. `live`, it
+    goes on with the newest.
+    """
+    inbox = inbox or Inbox()
+    stepper = Stepper(service, core, parts, source=source, live=live, first_step=first_step)
+    loop = _Loop(stepper, bus, run, wait_for if source else (), live=live)
+    bus.answer(service.outputs, loop.outbox.answer)
+    bus.subscribe(loop.topics + ((STATUS,) if loop.awaited else ()) + loop.watched, inbox.put)
+    loop.join(inbox)
+    with Heartbeat(bus, loop.health, inbox.stop):
+        loop.health.say("ready", WAITS + ", ".join(sorted(loop.awaited)) if loop.awaited else loop.notes)
+        loop.begin_if_due()
+        loop.catch_up()
+        news_s = time.monotonic()
+        for item in inbox.items(0.0 if source else DRAIN_S, IDLE_S, lambda: loop.wait_s):
+            if item is not None:
+                loop.handle(*item, more=loop.looks_ahead and inbox.waiting)
+            elif loop.looks_ahead:
+                loop.work_off(service.trigger)
+            if not inbox.stopping.is_set():
+                loop.tick_if_due()
+                loop.share_if_due()
+            if item is not None and item[0] != STATUS:
+                news_s = time.monotonic()
+            elif time.monotonic() - news_s >= IDLE_S:
+                news_s = time.monotonic()
+                loop.catch_up()
+                loop.say_what_lacks()
+    return loop.health
+
+
+class _Loop:
+    """What one service does with one message."""
+
+    def __init__(self, stepper: Stepper, bus: Bus, run: str, wait_for: tuple[str, ...], *, live: bool) -> None:
+        service, core = stepper.service, stepper.core
+        self.health, self.outbox, self.awaited = Health(service.name), Outbox(), set(wait_for)
+        self.topics = service.inputs + ((service.closed_by,) if service.closed_by else ())
+        self._source = stepper.episode_done  # between episodes from the start
+        self._stepper, self._bus, self._run, self._service = stepper, bus, run, service
+        self.notes = "\n".join(getattr(core, "notes", ()))
+        self._ticker = Ticker(core.period_s) if stepper.timed else None
+        self._live, self._sequences = live, Sequences()
+        self._share = Share(service, stepper.parts) if service.divisible and not live else None
+        if self._share:
+            stepper.is_due = lambda at: self._share.lacks(core.names, at)
+        self._next_episode, self._closed = 0, -1
+        self._refused: set[Topic] = set()
+        self._end = core.episodes if self._source else 0
+
+    @property
+    def watched(self) -> tuple[Topic, ...]:
+        """What replicas of this service say: what one has answered the others need not."""
+        return self._service.outputs if self._share else ()
+
+    @property
+    def looks_ahead(self) -> bool:
+        """Whether everything that has come is looked at before a step is taken."""
+        return self._live or self._share is not None
+
+    def join(self, inbox: Inbox) -> None:
+        """Meets the replicas of this service, if it is one that can be shared. A source must be alone: raises
+        SaccadeError where another one is there."""
+        if self._share:
+            self._bus.join(self._service.name, self._share.me, lambda members: (self._share.met(members), inbox.wake()))
+            inbox.stopping.wait(MEET_S)
+            if self._share.changed:
+                inbox.stopping.wait(JOIN_S)
+                self.share_if_due()
+        elif self._source:
+            alone_on(self._bus, self._service.name)
+
+    def share_if_due(self) -> None:
+        """Takes over from a replica that is gone, gives to one that has come."""
+        if not self._share or not self._share.changed:
+            return
+        before, core = set(self._stepper.core.names), self._stepper.core
+        core.share(self._share.take_mine())
+        if set(core.names) - before:
+            self._step(self._service.trigger, None, self._stepper.again)
+        whole = core.names == self._stepper.parts
+        self.notes = "" if whole else f"answers for {', '.join(core.names) or 'nothing'}"
+        self.health.say(note=self.notes)
+
+    def handle(self, topic: Topic, part: str | None, payload: bytes, *, more: bool = False) -> None:
+        """Takes a message; runs the core for every complete step, unless there are `more` to look at first."""
+        if topic == STATUS:
+            self._note_status(part, payload)
+            return
+        if topic in self.watched:
+            self._note_answer(topic, part, payload)
+        else:
+            self._take(topic, part, payload)
+        if not more:
+            self.work_off(topic, part)
+
+    def work_off(self, topic: Topic, part: str | None = None) -> None:
+        """Every step that is complete."""
+        while self._step(topic, part, self._stepper.advance):
+            self.begin_if_due()
+
+    def _note_answer(self, topic: Topic, part: str | None, payload: bytes) -> None:
+        """Keeps what another replica said: should that one die, this one can still be asked for it. What is no message
+        is no answer."""
+        with suppress(MessageError):
+            if not self._share.is_answered(topic, part, stamp_of(payload)):
+                message = decode(topic.type, payload)
+                self._share.answered(topic, part, message)
+                self.outbox.keep(topic, part, message, payload)
+
+    def _take(self, topic: Topic, part: str | None, payload: bytes) -> None:
+        self.health.received += 1
+        try:
+            message = decode(topic.type, payload)
+            self.health.gaps += self._sequences.take(topic, part, message) or 0
+            if topic == self._service.closed_by:
+                self._close(message)
+                return
+            self._stepper.offer(topic, part, message)
+        except MessageError as error:
+            self.health.refuse(topic, part, error)
+            if topic not in self._refused:  # once, for whoever reads what the process prints
+                self._refused.add(topic)
+                print(f"saccade: {self.health.service}: {self.health.note}", file=sys.stderr, flush=True)
+
+    def begin_if_due(self) -> None:
+        """Begins a source's next episode, if everyone is there and the one before it is over and closed."""
+        while self._source and not self.awaited and self._stepper.episode_done and self._is_closed:
+            if self._next_episode >= self._end:
+                self.health.say("finished")
+                return
+            episode, self._next_episode = self._next_episode, self._next_episode + 1
+            self._step(None, None, lambda e=episode: self._stepper.begin(self._run, e))
+            if self._ticker:
+                self._ticker.start()
+
+    def tick_if_due(self) -> None:
+        """The next frame of a source that goes by time."""
+        if self._ticker and self._ticker.take():
+            self._step(None, None, self._stepper.tick)
+            if self._stepper.episode_done:
+                self._ticker.stop()
+                self.begin_if_due()
+
+    @property
+    def wait_s(self) -> float:
+        """Seconds until this service has something to do by itself."""
+        return self._ticker.wait_s if self._ticker else math.inf
+
+    def catch_up(self) -> None:
+        """Asks for inputs that were published and have not come, until there are none that lead on. Where nobody waits
+        what is past is past: only what holds for the whole episode is asked for."""
+        latched = [topic for topic in self.topics if topic.latched and topic != self._service.closed_by]
+        others = [topic for topic in self.topics if topic not in latched and not self._live]
+        while not self.awaited:
+            wants = self._stepper.wants
+            episode = wants and (*wants[:2], 0)
+            kept = self._bus.recall((*self.watched, *latched), episode) + self._bus.recall(others, wants)
+            for topic, part, payload, *_ in kept:
+                self.handle(topic, part, payload)
+            if self._stepper.wants == wants:
+                return
+
+    def say_what_lacks(self) -> None:
+        """Nothing has come for a while: puts the inputs that the next step still needs into the status."""
+        if lacks := self._stepper.waits_for():
+            self.health.say(note=WAITS + ", ".join(lacks))
+
+    @property
+    def _is_closed(self) -> bool:
+        return self._service.closed_by is None or self._closed >= self._next_episode - 1
+
+    def _close(self, message: Message) -> None:
+        if message.run == self._run:
+            self._closed = max(self._closed, message.episode)
+            self.begin_if_due()
+
+    def _note_status(self, part: str | None, payload: bytes) -> None:
+        try:
+            status = decode(STATUS.type, payload)
+        except MessageError:
+            return  # whoever sent it is not ready
+        if part in self.awaited and status.state in READY_STATES:
+            self.awaited.discard(part)
+            if status.run == self._run:  # this source was here before: the others are in that episode already
+                past = 1 if self._ticker else 0  # what one that goes by time has shown does not come back
+                self._next_episode = max(self._next_episode, status.episode + past)
+                self._closed = self._next_episode - 1
+                self._end = self._stepper.core.episodes + past * self._next_episode
+            if not self.awaited:
+                self.health.say(note=self.notes)
+                self.begin_if_due()
+                self.catch_up()
+
+    def _step(self, topic: Topic | None, part: str | None, make: Callable[[], list[Output] | None]) -> bool:
+        """Runs the core once and publishes what it made; whether there was anything to do."""
+        before, self.health.state = self.health.state, "busy"
+        start = time.perf_counter()
+        try:
+            outputs = make()
+            if outputs is None:
+                return False
+            self.health.milliseconds = (time.perf_counter() - start) * 1e3
+            self._publish(outputs)
+            if self.health.note.startswith(WAITS):
+                self.health.say(note=self.notes)
+        except MessageError as error:
+            if topic is None:
+                name = self.health.service
+                raise SaccadeError(f"{name} cannot begin episode {self._next_episode - 1}: {error}") from error
+            self.health.refuse(topic, part, error)
+        finally:
+            self.health.state = before
+            self.health.at = self._stepper.at
+            self.health.skipped = self._stepper.skipped + getattr(self._stepper.core, "skipped", 0)
+        return True
+
+    def _publish(self, outputs: list[Output]) -> None:
+        if self._share:
+            outputs = [o for o in outputs if not self._share.is_answered(o.topic, o.part, o.message)]
+        encoded = []
+        for output in outputs:  # all before the first is sent: a step is published as a whole or not at all
+            try:
+                encoded.append(encode(output.message))
+            except MessageError as error:
+                raise MessageError(f"gives an invalid {output.topic.name}: {error}") from error
+        for output, payload in zip(outputs, encoded, strict=True):
+            self.outbox.keep(output.topic, output.part, output.message, payload)
+            if self._share:
+                self._share.answered(output.topic, output.part, output.message)
+            self._bus.publish(output.topic, output.part, payload)
+            self.health.published += 1

@@ -1,0 +1,192 @@
+"""What every service process has around its work: arguments, signals, heartbeat, exit code."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import math
+import os
+import queue
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from saccade.shared.bus.messages import Status
+from saccade.shared.bus.topics import STATUS, Topic
+from saccade.shared.bus.transport import Bus
+from saccade.shared.bus.wire import encode
+from saccade.shared.config import Config, load
+from saccade.shared.errors import SaccadeError
+
+HEARTBEAT_S = 0.5
+SHORTEST_S = 0.05  # between two statuses, however many messages are refused
+QUIET_S = 0.1  # a service told to stop first works off what is already on its way: until nothing came for so long,
+DRAIN_S = 1.0  # or for so long in all
+EXIT_ERROR = 2
+NOTE_LENGTH = 1000
+REFUSED = "refused: "
+STARTING = "starting"
+HEARTBEAT_VARIABLE = "SACCADE_HEARTBEAT"  # a file for whoever is not on the bus: its age and the state in it
+LAUNCHER_VARIABLE = "SACCADE_LAUNCHER"  # the launcher's process id: the service stops if that is no longer its parent
+
+Item = tuple[Topic, str | None, bytes]
+
+
+class Inbox:
+    """Items from the bus's thread for the main thread; beyond `limit_bytes` new ones are dropped and counted."""
+
+    def __init__(self, limit_bytes: int | None = None) -> None:
+        self.stopping = threading.Event()
+        self.dropped = 0
+        self._limit, self._held, self._lock = limit_bytes, 0, threading.Lock()
+        self._queue: queue.SimpleQueue[Item | None] = queue.SimpleQueue()
+
+    def put(self, topic: Topic, part: str | None, payload: bytes) -> None:
+        """For `Bus.subscribe`; never blocks."""
+        with self._lock:
+            if self._limit is not None and self._held + len(payload) > self._limit:
+                self.dropped += 1
+                return
+            self._held += len(payload)
+        self._queue.put((topic, part, payload))
+
+    def stop(self) -> None:
+        """Wakes `get` with None and ends `items`. Safe in a signal handler."""
+        self.stopping.set()
+        self._queue.put(None)
+
+    def get(self, timeout_s: float | None = None) -> Item | None:
+        """The next item; None after `timeout_s` seconds and where `stop` was called."""
+        with contextlib.suppress(queue.Empty):
+            item = self._queue.get(timeout=timeout_s)
+            if item is not None:
+                with self._lock:
+                    self._held -= len(item[2])
+            return item
+        return None
+
+    def wake(self) -> None:
+        """Has `items` give a None soon, where it has a `tick_s`."""
+        self._queue.put(None)
+
+    @property
+    def waiting(self) -> bool:
+        """Whether something is there to be taken."""
+        return not self._queue.empty()
+
+    def items(self, drain_s: float = DRAIN_S, tick_s: float | None = None,
+              wait_s: Callable[[], float] = lambda: math.inf) -> Iterator[Item | None]:
+        """Every item up to `stop`, then what follows without a pause, for `drain_s` seconds at most. With `tick_s`
+        also None whenever nothing came for so long, or for `wait_s()` where that is less."""
+        while True:
+            item = self.get(None if tick_s is None else min(tick_s, wait_s()))
+            if item is None and self.stopping.is_set():
+                break  # behind everything that came before `stop`, but for a tick at that very moment
+            if item is not None or tick_s is not None:
+                yield item
+        end = time.monotonic() + drain_s
+        while time.monotonic() < end and (item := self.get(QUIET_S)) is not None:
+            yield item
+
+
+@dataclass
+class Health:
+    """What a service says about itself; plain numbers written by its main thread, read by the heartbeat."""
+
+    service: str
+    state: str = STARTING
+    note: str = ""
+    at: tuple[str, int, int] = ("", 0, 0)  # run, episode, step
+    received: int = 0
+    published: int = 0
+    refused: int = 0
+    skipped: int = 0
+    gaps: int = 0
+    milliseconds: float = 0.0
+    changed: threading.Event = field(default_factory=threading.Event)
+
+    def say(self, state: str | None = None, note: str | None = None) -> None:
+        """Changes state or note, and has it published soon."""
+        self.state = self.state if state is None else state
+        self.note = self.note if note is None else note[:NOTE_LENGTH]
+        self.changed.set()
+
+    def refuse(self, topic: Topic, part: str | None, reason: object) -> None:
+        """Counts a message that was no good and says which field of it."""
+        self.refused += 1
+        self.say(note=f"{REFUSED}{topic.name}{f'/{part}' if part else ''}: {reason}")
+
+    def status(self, seq: int) -> Status:
+        """The message for the bus."""
+        run, episode, step = self.at
+        return Status(run=run, episode=episode, step=step, seq=seq, service=self.service, state=self.state,
+                      received=self.received, published=self.published, refused=self.refused, skipped=self.skipped,
+                      gaps=self.gaps, milliseconds=self.milliseconds, note=self.note)
+
+
+class Heartbeat:
+    """Publishes a Health every half second and at once when it changes, also while the main thread is busy."""
+
+    def __init__(self, bus: Bus, health: Health, on_orphaned: Callable[[], None] = lambda: None) -> None:
+        self._bus, self._health, self._on_orphaned = bus, health, on_orphaned
+        self._stop = threading.Event()
+        self._seq = 0
+        self._parent, self._file = os.environ.get(LAUNCHER_VARIABLE), os.environ.get(HEARTBEAT_VARIABLE)
+        self._thread = threading.Thread(target=self._run, name="heartbeat", daemon=True)
+
+    def __enter__(self) -> Heartbeat:
+        self._thread.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        self._health.state = "stopped" if kind is None else "failed"
+        self._stop.set()
+        self._health.changed.set()
+        self._thread.join(timeout=2.0)
+        self._publish()
+
+    def _run(self) -> None:
+        while not self._stop.wait(SHORTEST_S):
+            self._publish()
+            self._health.changed.wait(HEARTBEAT_S)
+            self._health.changed.clear()
+            if self._parent is not None and str(os.getppid()) != self._parent:
+                self._on_orphaned()
+
+    def _publish(self) -> None:
+        if self._file:
+            with contextlib.suppress(OSError):  # whoever reads it sees that it grows old
+                Path(self._file).write_text(self._health.state)
+        self._bus.publish(STATUS, self._health.service, encode(self._health.status(self._seq)))
+        self._seq += 1
+
+
+def run_process(name: str, work: Callable[[Config, Path, Inbox], None], *, inbox: Inbox | None = None,
+                argv: Sequence[str] | None = None) -> None:
+    """`work(config, folder, inbox)` between the command line and the exit code; `folder` is the configuration file's.
+
+    SIGTERM and SIGINT stop the inbox, a second one the process. SaccadeError is one line on stderr and exit code 2.
+    """
+    parser = argparse.ArgumentParser(prog=f"python -m services.{name}", description=f"Saccade's {name} service.")
+    parser.add_argument("--config", type=Path, required=True, metavar="FILE", help="configuration of the run (JSON)")
+    arguments = parser.parse_args(argv)
+    inbox = inbox or Inbox()
+
+    def on_signal(number: int, _frame: object) -> None:
+        if inbox.stopping.is_set():
+            os._exit(128 + number)
+        inbox.stop()
+
+    before = {number: signal.signal(number, on_signal) for number in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        work(load(arguments.config), arguments.config.resolve().parent, inbox)
+    except SaccadeError as error:
+        print(f"saccade: {error}", file=sys.stderr, flush=True)
+        sys.exit(EXIT_ERROR)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

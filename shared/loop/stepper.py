@@ -1,0 +1,240 @@
+"""Which inputs belong together, when a core may step, and what number its messages get: pure, without bus or clock.
+
+The bus loop and the in-process runner both drive cores through `Stepper`, so that their outputs are equal to the byte.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import numpy as np
+
+from saccade.shared.bus.messages import Message
+from saccade.shared.bus.sequences import Stamper
+from saccade.shared.bus.topics import TRUTH, Output, Topic
+from saccade.shared.bus.wire import MessageError
+from saccade.shared.errors import SaccadeError
+from saccade.shared.loop.service import Core, Service
+
+MAX_PENDING = 256  # incomplete steps kept, so that a flood of stray messages cannot fill the memory
+
+Episode = tuple[str, int]  # run and number
+Slot = dict[str, dict[str | None, Message]]  # topic name -> part -> message
+
+
+class Stepper:
+    """One core between its inputs and its outputs.
+
+    `offer` files a message, `advance` runs the core if a step is complete. In lockstep each step of an episode is
+    taken, from the first (`first_step`; a log that was cut begins later): a core's state is a fold over all of them,
+    and what is lacking can be asked for (`wants`). `live`, the newest complete step is taken and those before it are
+    skipped. A latched message of step s holds from step s of its episode. `parts` are the names of the run's objects.
+    For a source, `begin` starts an episode, and the inputs must answer the step it published last.
+    """
+
+    def __init__(self, service: Service, core: Core, parts: tuple[str, ...], *, source: bool = False,
+                 live: bool = False, first_step: int = 0) -> None:
+        if service.trigger not in service.inputs:
+            raise SaccadeError(f"service {service.name}: its trigger {service.trigger.name} is not among its inputs")
+        self.service, self.core, self.parts = service, core, parts
+        self.skipped = 0  # steps that never became complete
+        self.episode_done = source  # a source is between episodes
+        self.at: tuple[str, int, int] = ("", 0, 0)  # run, episode, step last begun or stepped
+        self._source, self._live, self._first_step = source, live, first_step
+        self._begun: Episode | None = None
+        self._past_runs: set[str] = set()
+        self._last_step = -1  # of the current episode
+        self._slots: dict[tuple[str, int, int], Slot] = {}
+        self._latched: dict[Episode, dict[str, dict[str | None, list[Message]]]] = {}
+        self._stamper = self._new_stamper()
+        self._inputs_taken: dict[str, Any] | None = None  # of the last step, of a divisible service
+        self.is_due: Callable[[tuple[str, int, int]], bool] = lambda at: True  # whether a step is still to be answered
+        self._topics = {topic.name: topic for topic in service.inputs}
+
+    def offer(self, topic: Topic, part: str | None, message: Message) -> None:
+        """Files an input. One that comes too late is ignored. Raises MessageError for one that fits nowhere."""
+        if topic.name not in self._topics:
+            raise MessageError("topic: not an input")
+        if topic.parts and part not in self.parts:
+            raise MessageError(f"part: {part!r} is not an object of this run")
+        if topic.parts and getattr(message, "object", part) != part:
+            raise MessageError(f"object: {message.object!r} under the key of {part!r}")
+        if self._late(message, topic):
+            return
+        message = settle(message)
+        if topic.latched:
+            self._latch(topic, part, message)
+            return
+        if self._source and message.step != self._last_step:
+            raise MessageError(f"step: {message.step}, not {self._last_step}")
+        slot = self._slots.setdefault((message.run, message.episode, message.step), {})
+        known = slot.setdefault(topic.name, {}).setdefault(part, message)
+        if known is not message and not _same(known, message):
+            raise MessageError(f"step: a second, other message for step {message.step}")
+        self._limit()
+
+    def begin(self, run: str, episode: int) -> list[Output]:
+        """Starts an episode of a source and returns its first outputs."""
+        return self._emit(self._start((run, episode)))
+
+    def tick(self) -> list[Output]:
+        """The next frame of a source that goes by time; without one its episode is done."""
+        outputs = self._emit(self.core.next_frame())
+        self.episode_done |= not outputs
+        return outputs
+
+    @property
+    def timed(self) -> bool:
+        """Whether this is a source that goes by time."""
+        return self._source and hasattr(self.core, "next_frame")
+
+    def advance(self) -> list[Output] | None:
+        """Runs the core on the next complete step: its stamped outputs, or None if no step is complete."""
+        while True:
+            at = self._next_complete()
+            if at is None:
+                return None
+            run, episode, step = at
+            inputs = self._inputs(at)
+            first = [] if self._begun == (run, episode) else self._emit(self._start((run, episode)))
+            self._last_step, self.at = step, at
+            self._forget(at)
+            self._inputs_taken = inputs if self.service.divisible else None
+            return first + (self._emit(self.core.step(inputs)) if self.is_due(at) else [])
+
+    def again(self) -> list[Output]:
+        """The outputs of the last step once more, from a core that answers for other objects now."""
+        return [] if self._inputs_taken is None else self._emit(self.core.step(self._inputs_taken))
+
+    @property
+    def wants(self) -> tuple[str, int, int] | None:
+        """Run, episode and step from which on inputs are needed; None before the first episode."""
+        if self._begun is None:
+            return None
+        return (*self._begun, max(0, self._last_step if self._source else self._last_step + 1))
+
+    def waits_for(self) -> list[str]:
+        """What the next step lacks, as texts such as 'percept/mug of step 3'; empty if nothing is open."""
+        if not self._slots:
+            return []
+        at = min(self._slots, key=lambda a: a[1:])
+        if not self._live and not self._source:
+            due = self._last_step + 1 if self._begun == at[:2] else self._first_step
+            at = (*at[:2], min(at[2], due))
+        return [f"{name if part is None else f'{name}/{part}'} of step {at[2]} of episode {at[1]}"
+                for name, part in self._lacks(at)]
+
+    def _late(self, message: Message, topic: Topic) -> bool:
+        if message.run in self._past_runs:
+            return True
+        if self._begun is None or message.run != self._begun[0]:
+            return self._source
+        if message.episode != self._begun[1]:
+            return message.episode < self._begun[1]
+        if self._source:
+            return self.episode_done or message.step < self._last_step
+        return not topic.latched and message.step <= self._last_step
+
+    def _latch(self, topic: Topic, part: str | None, message: Message) -> None:
+        known = self._latched.setdefault((message.run, message.episode), {}).setdefault(topic.name, {})
+        held = [m for m in known.get(part, []) if m.step != message.step]
+        known[part] = sorted([*held, message], key=lambda m: m.step)[-MAX_PENDING:]
+        while len(self._latched) > MAX_PENDING:
+            self._latched.pop(next(iter(self._latched)))
+
+    def _limit(self) -> None:
+        while len(self._slots) > MAX_PENDING:
+            self._skip(next(iter(self._slots)))
+
+    def _lacks(self, at: tuple[str, int, int]) -> list[tuple[str, str | None]]:
+        slot, latched = self._slots.get(at, {}), self._latched.get(at[:2], {})
+        lacking = []
+        for topic in self.service.inputs:
+            for part in self.parts if topic.parts else (None,):
+                if topic.latched:
+                    present = any(m.step <= at[2] for m in latched.get(topic.name, {}).get(part, []))
+                else:
+                    present = part in slot.get(topic.name, {})
+                if not present:
+                    lacking.append((topic.name, part))
+        return lacking
+
+    def _next_complete(self) -> tuple[str, int, int] | None:
+        complete = [at for at in self._slots if self._is_due(at) and not self._lacks(at)]
+        if not complete:
+            return None
+        run = complete[0][0]  # runs follow one another in order of arrival, their steps by number
+        return (max if self._live else min)(at for at in complete if at[0] == run)
+
+    def _is_due(self, at: tuple[str, int, int]) -> bool:
+        """Whether this step may be the next one."""
+        if self._live or self._source:
+            return True
+        return at[2] == (self._last_step + 1 if self._begun == at[:2] else self._first_step)
+
+    def _inputs(self, at: tuple[str, int, int]) -> dict[str, Any]:
+        slot, latched = self._slots[at], self._latched.get(at[:2], {})
+
+        def value(topic: Topic, part: str | None) -> Message:
+            if topic.latched:
+                return [m for m in latched[topic.name][part] if m.step <= at[2]][-1]
+            return slot[topic.name][part]
+
+        return {t.name: {p: value(t, p) for p in self.parts} if t.parts else value(t, None)
+                for t in self.service.inputs}
+
+    def _start(self, episode: Episode) -> Iterable[Output]:
+        if self._begun is not None and self._begun[0] != episode[0]:
+            self._past_runs.add(self._begun[0])
+        self._begun, self._last_step, self.at = episode, -1, (*episode, 0)
+        self.episode_done, self._stamper, self._inputs_taken = False, self._new_stamper(), None
+        self._latched = {e: v for e, v in self._latched.items() if e[0] != episode[0] or e[1] >= episode[1]}
+        return self.core.begin(*episode)
+
+    def _new_stamper(self) -> Stamper:
+        return Stamper(self._first_step if self.service.divisible and not self._live else None)
+
+    def _forget(self, at: tuple[str, int, int]) -> None:
+        """Drops the step and those before it: of one key all came in order, so what these lack is lost."""
+        del self._slots[at]
+        for old in [a for a in self._slots if a[0] in self._past_runs or (a[0] == at[0] and a[1:] < at[1:])]:
+            self._skip(old)
+
+    def _skip(self, at: tuple[str, int, int]) -> None:
+        del self._slots[at]
+        self.skipped += not self._source  # what a source skips are images, and it counts them itself
+
+    def _emit(self, outputs: Iterable[Output] | None) -> list[Output]:
+        stamped = []
+        for output in outputs or ():
+            if output.topic not in self.service.outputs:
+                raise SaccadeError(f"service {self.service.name} does not declare its output {output.topic.name}")
+            stamped.append(self._stamper.stamp(output))
+            if self._source:
+                self._last_step = max(self._last_step, output.message.step)
+                self.at = (output.message.run, output.message.episode, self._last_step)
+                self.episode_done |= output.topic == TRUTH and output.message.done
+        return stamped
+
+
+def _same(one: Message, other: Message) -> bool:
+    return all(np.array_equal(getattr(one, field.name), getattr(other, field.name))
+               for field in dataclasses.fields(one))
+
+
+def settle(message: Message) -> Message:
+    """The message with arrays that are aligned, contiguous and frozen.
+
+    Bytes from the wire are seldom aligned, and NumPy may sum unaligned numbers in another order: without this the same
+    message would give other bytes in another process. Frozen, no core can change what another one holds.
+    """
+    changed = {}
+    for field in dataclasses.fields(message):
+        value = getattr(message, field.name)
+        if isinstance(value, np.ndarray) and not (
+                value.flags.aligned and value.flags.c_contiguous and not value.flags.writeable):
+            changed[field.name] = np.array(value, order="C")
+            changed[field.name].flags.writeable = False
+    return dataclasses.replace(message, **changed) if changed else message

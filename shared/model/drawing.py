@@ -1,0 +1,113 @@
+"""p(o | p) in NumPy: crops drawn from latent poses, without the networks' library (paper, section 3.2 and table 6).
+
+The twin of `Decoder` and `PaperDecoder` in `shared/model/generative_model.py`, which training and perception use.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from saccade.shared.errors import SaccadeError
+from saccade.shared.model.latent import LEAK
+from saccade.shared.model.weights import Weights
+
+Array = NDArray[np.float32]
+Layer = Callable[[Array], Array]
+
+PREFIX = "ccn.decoder."
+START = (64, 8, 8)  # channels, height and width of what the linear layers give
+
+
+class LatentDecoder:
+    """Draws one object. Raises SaccadeError where its weights are not those of a decoder."""
+
+    def __init__(self, weights: Weights, name: str) -> None:
+        state = weights.state(name, PREFIX)
+        try:
+            make = _paper if weights.architecture == "paper" else _default
+            self._linear, self._layers = make(state)
+            self(np.zeros(self._linear[0][0].shape[0], np.float32))
+        except (KeyError, ValueError) as error:
+            raise SaccadeError(f"weights {weights.folder / name} are of another architecture: train anew") from error
+
+    def __call__(self, latent: Array) -> Array:
+        """A latent mean [L] -> a crop on black [3, 64, 64]."""
+        x = latent
+        for weight, bias, leaky in self._linear:
+            x = x @ weight + bias
+            x = rectified(x) if leaky else x
+        x = x.reshape(START)
+        for layer in self._layers:
+            x = layer(x)
+        return x
+
+
+def _default(state: dict[str, Array]) -> tuple[list, list[Layer]]:
+    linear = [(*_linear(state, f"linear.{i}"), True) for i in (0, 2)]
+    layers: list[Layer] = []
+    for i in (0, 3, 6):
+        layers += [_convolution(state, f"convolutions.{i}", margin=1), shuffled, rectified]
+    return linear, [*layers, _convolution(state, "convolutions.9", margin=1)]
+
+
+def _paper(state: dict[str, Array]) -> tuple[list, list[Layer]]:
+    layers: list[Layer] = []
+    for i, side in ((0, 17), (3, 35), (6, 69)):
+        layers += [_convolution(state, f"convolutions.{i}"), rectified, functools.partial(enlarged, side=side)]
+    layers += [_convolution(state, "convolutions.9"), rectified, _convolution(state, "convolutions.11")]
+    return [(*_linear(state, "linear"), False)], layers
+
+
+def _linear(state: dict[str, Array], name: str) -> tuple[Array, Array]:
+    return np.ascontiguousarray(state[f"{name}.weight"].T), state[f"{name}.bias"]
+
+
+def _convolution(state: dict[str, Array], name: str, margin: int = 0) -> Layer:
+    weight, bias = state[f"{name}.weight"], state[f"{name}.bias"]
+    side = weight.shape[-1]
+    taps = np.ascontiguousarray(weight.transpose(2, 3, 0, 1)).reshape(side * side, *weight.shape[:2])
+
+    def convolve(x: Array) -> Array:
+        x = np.pad(x, ((0, 0), (margin, margin), (margin, margin)))
+        height, width = x.shape[1] - side + 1, x.shape[2] - side + 1
+        flat = np.broadcast_to(bias[:, None], (len(bias), height * width)).copy()
+        for k, tap in enumerate(taps):
+            row, column = divmod(k, side)
+            flat += tap @ x[:, row:row + height, column:column + width].reshape(len(x), -1)
+        return flat.reshape(-1, height, width)
+
+    return convolve
+
+
+def rectified(x: Array) -> Array:
+    """A leaky rectifier."""
+    return np.maximum(x, LEAK * x)
+
+
+def shuffled(x: Array) -> Array:
+    """Channels become pixels: [4 C, H, W] -> [C, 2 H, 2 W]."""
+    channels, height, width = x.shape
+    blocks = x.reshape(channels // 4, 2, 2, height, width).transpose(0, 3, 1, 4, 2)
+    return blocks.reshape(channels // 4, 2 * height, 2 * width)
+
+
+def enlarged(x: Array, side: int) -> Array:
+    """Bilinear, pixels' corners kept apart: [C, H, H] -> [C, side, side]."""
+    between = _between(x.shape[-1], side)
+    return between @ x @ between.T
+
+
+@functools.cache
+def _between(old: int, new: int) -> Array:
+    """The weights [new, old] of the old pixels in the new ones."""
+    place = np.clip((np.arange(new) + 0.5) * old / new - 0.5, 0, None)
+    low = np.floor(place).astype(np.int64)
+    high, share = np.minimum(low + 1, old - 1), place - low
+    weights = np.zeros((new, old), np.float32)
+    np.add.at(weights, (np.arange(new), low), 1 - share)
+    np.add.at(weights, (np.arange(new), high), share)
+    return weights

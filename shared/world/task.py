@@ -1,0 +1,131 @@
+"""The task's rules (paper, section 4.1): where the camera starts and may go, what an action does, what success is.
+
+Pure functions of poses: no rendering, so that simulator, evaluator, planner and training share one definition.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from saccade.shared.world.geometry import Array, direction, look_at, rotation_angle, rotation_xyz, spherical, wrap
+
+MAX_STEPS = 350
+ACTION_LIMIT = 0.5  # metres and radians, each component
+LOWER_M = np.array([-0.5, -0.5, 0.1])  # the workspace of the camera
+UPPER_M = np.array([0.5, 0.5, 0.6])
+CLEARANCE_M = 0.06  # beyond half the diagonal of an object's box
+GOAL_CLEARANCE_M = 0.05  # the same for the nearest goals; the clearance above then pushes them out
+SUCCESS_TRANSLATION_M = 0.075
+SUCCESS_ROTATION_RAD = 0.5
+START_ELEVATION_RAD, START_RANGE_M = np.pi / 4, 0.65
+TOLERANCE_M = 1e-9
+
+
+@dataclass(frozen=True)
+class Spheres:
+    """What `clip` pushes the camera out of: centres [N, 3] and radii [N], metres."""
+
+    centers_m: Array
+    radii_m: Array
+
+    def depth_m(self, position: ArrayLike) -> float:
+        """How deep a position [3] is inside the worst sphere; at most 0 outside all of them."""
+        if len(self.radii_m) == 0:
+            return 0.0
+        return float((self.radii_m - np.linalg.norm(self.centers_m - np.asarray(position), axis=1)).max())
+
+
+def spheres_around(centers_m: ArrayLike, sizes_m: ArrayLike) -> Spheres:
+    """Spheres around objects with box centres [N, 3] and box extents [N, 3], metres."""
+    radii = np.linalg.norm(np.asarray(sizes_m, dtype=np.float64).reshape(-1, 3), axis=1) / 2 + CLEARANCE_M
+    return Spheres(np.asarray(centers_m, dtype=np.float64).reshape(-1, 3), radii)
+
+
+def start_pose() -> Array:
+    """world_from_camera [4, 4] at the beginning of every episode: azimuth 0, looking at the table's centre."""
+    return look_at(START_RANGE_M * direction(0.0, START_ELEVATION_RAD), np.zeros(3))
+
+
+def clip(position: ArrayLike, spheres: Spheres) -> Array:
+    """What stands for each position [..., 3]: pushed radially out of one sphere after another, then into the workspace.
+
+    One pass, as in the benchmark: its published goals are clipped so, and a few lie inside a sphere because a later
+    sphere moved them there. Under a stricter rule no agent could get to all of them.
+    """
+    result = np.asarray(position, dtype=np.float64)
+    for center, radius in zip(spheres.centers_m, spheres.radii_m, strict=True):
+        offset = result - center
+        distance = np.linalg.norm(offset, axis=-1, keepdims=True)
+        away = np.where(distance > TOLERANCE_M, offset / np.maximum(distance, TOLERANCE_M), (0.0, 0.0, 1.0))
+        result = np.where(distance < radius, center + radius * away, result)
+    return np.clip(result, LOWER_M, UPPER_M)
+
+
+def apply_action(world_from_camera: ArrayLike, translation_m: ArrayLike, rotation_rad: ArrayLike) -> Array:
+    """The camera pose [4, 4] after an action, before `clip`: moved by translation [3], turned about the world's axes.
+
+    Components beyond the action space are brought back into it; the rotation is made orthonormal again.
+    """
+    before = np.asarray(world_from_camera, dtype=np.float64)
+    turn = rotation_xyz(np.clip(rotation_rad, -ACTION_LIMIT, ACTION_LIMIT))
+    u, _, vt = np.linalg.svd(turn @ before[:3, :3])
+    after = np.eye(4)
+    after[:3, :3] = u @ vt
+    after[:3, 3] = before[:3, 3] + np.clip(translation_m, -ACTION_LIMIT, ACTION_LIMIT)
+    return after
+
+
+def success(world_from_camera: ArrayLike, goal_world_from_camera: ArrayLike) -> bool:
+    """Whether a camera pose is within both tolerances of the goal pose."""
+    camera, goal = np.asarray(world_from_camera), np.asarray(goal_world_from_camera)
+    near = np.linalg.norm(camera[:3, 3] - goal[:3, 3]) < SUCCESS_TRANSLATION_M
+    return bool(near and rotation_angle(camera[:3, :3], goal[:3, :3]) < SUCCESS_ROTATION_RAD)
+
+
+def errors(position: ArrayLike, goal_position: ArrayLike, target_center: ArrayLike) -> tuple[float, float, float]:
+    """(|azimuth| rad, |elevation| rad, |range| m) between two camera positions [3], seen from the target's centre."""
+    azimuth, elevation, distance = spherical(position, target_center)
+    goal_azimuth, goal_elevation, goal_distance = spherical(goal_position, target_center)
+    return (float(abs(wrap(azimuth - goal_azimuth))), float(abs(elevation - goal_elevation)),
+            float(abs(distance - goal_distance)))
+
+
+class Episode:
+    """The camera's way through one scene, by the rules. Without a goal to judge by (`judged=False`) none succeeds.
+
+    It ends at the goal, as in the paper, or with `until="declared"` when the agent first says that it is there.
+    """
+
+    def __init__(self, goal_world_from_camera: ArrayLike, spheres: Spheres, *, max_steps: int = MAX_STEPS,
+                 judged: bool = True, until: Literal["reached", "declared"] = "reached"):
+        self.goal = np.asarray(goal_world_from_camera, dtype=np.float64)
+        self.spheres, self.max_steps, self.judged, self.until = spheres, max_steps, judged, until
+        self.reached = False  # whether the camera has been at the goal, at any step
+        self.step, self.declared, self.declared_true = 0, False, False
+        self.camera = self._allowed(start_pose())
+
+    def _allowed(self, camera: Array) -> Array:
+        camera[:3, 3] = clip(camera[:3, 3], self.spheres)
+        return camera
+
+    def act(self, translation_m: ArrayLike, rotation_rad: ArrayLike, *, arrived: bool = False) -> None:
+        """Moves. `arrived`: the agent says that with this move it is there; judged once, the first time."""
+        self.camera = self._allowed(apply_action(self.camera, translation_m, rotation_rad))
+        self.step += 1
+        self.reached |= self.success
+        if arrived and not self.declared:
+            self.declared, self.declared_true = True, self.success
+
+    @property
+    def success(self) -> bool:
+        """Whether the camera is at the goal now; judged after every action, so never at the start."""
+        return self.judged and self.step > 0 and success(self.camera, self.goal)
+
+    @property
+    def done(self) -> bool:
+        """Whether the episode is over: at the goal (or declared to be), or out of steps."""
+        return (self.reached if self.until == "reached" else self.declared) or self.step >= self.max_steps
