@@ -1,6 +1,6 @@
-"""`python -m saccade.benchmarks.constants [out.json]`: what the agent's own constants are worth. Each constant of belief
-and planner, and each number of their configuration, at half and at twice its value, on the 100 development scenes.
-
+"""`python -m saccade.benchmarks.constants [out.json]`: what the agent's own constants are worth. Each constant of
+belief and planner, and each number of their configuration, at half and at twice its value, on the 100 development
+scenes. 
 A probability is doubled to 0.99 at most. What is done already in `out.json` is not done again.
 """
 
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ast
 import json
+import math
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -15,8 +16,6 @@ from importlib import import_module
 from pathlib import Path
 from statistics import fmean, median, stdev
 from typing import Any
-
-import numpy as np
 
 from saccade.app.bench.bench import RUN, prepare, record_of
 from saccade.app.run.registry import local_pairs
@@ -59,8 +58,8 @@ class Constant:
 
 
 def constants() -> Iterator[Constant]:
-    """All of them, in the order of the source: those whose comment says where the number is from, and the numbers of the
-    configuration."""
+    """All of them, in the order of the source: those whose comment says where the number is from, and the numbers of
+    the configuration."""
     for module in MODULES:
         source = (PACKAGE / Path(*module.split("."))).with_suffix(".py").read_text()
         lines = source.splitlines()
@@ -117,7 +116,7 @@ def told(records: list[dict[str, Any]], default: list[dict[str, Any]]) -> dict[s
     more = [a["steps"] - b["steps"] for a, b in zip(records, default, strict=True)]
     return {"reached": sum(r["success"] for r in records), "median_steps": median(r["steps"] for r in records),
             "mean_steps": round(fmean(r["steps"] for r in records), 2), "more_steps": round(fmean(more), 2),
-            "more_steps_error": round(stdev(more) / np.sqrt(len(more)), 2)}
+            "more_steps_error": round(stdev(more) / math.sqrt(len(more)), 2)}
 
 
 def main(out: Path) -> None:

@@ -20,6 +20,7 @@ class Section(BaseModel):
 
 
 Checked = TypeVar("Checked", bound=Section)
+ModuleName = Annotated[str, Field(pattern=r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*$")]
 Focal = Annotated[FiniteFloat, Field(gt=0)]
 
 
@@ -112,6 +113,15 @@ class PlannerConfig(Section):
     information_weight: float = Field(1.0, ge=0)
 
 
+class ServicesConfig(Section):
+    """Modules from outside that stand in the place of our services: each declares a SERVICE and builds a core."""
+
+    source: ModuleName | None = None  # of the simulator, or of the camera where that is the world
+    perception: ModuleName | None = None
+    belief: ModuleName | None = None
+    planner: ModuleName | None = None
+
+
 class ViewerConfig(Section):
     """Where browsers find the viewer, and what it may keep. The page is on `port`, its data on `data_port` (0: a free
     one); `truth`: also what the simulator alone knows."""
@@ -136,6 +146,7 @@ class Config(Section):
     belief: BeliefConfig = BeliefConfig()
     planner: PlannerConfig = PlannerConfig()
     viewer: ViewerConfig = ViewerConfig()
+    services: ServicesConfig = ServicesConfig()
 
     @property
     def weights(self) -> Path:

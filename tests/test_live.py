@@ -75,7 +75,7 @@ class Running:
             self.threads[-1].start()
 
     def _serve(self, service, core, wait_for, inbox) -> None:
-        self.health[service.name] = serve(service, core, self.bus, PARTS, run="r", source=service is TIMED, live=True,
+        self.health[service.name] = serve(service, core, self.bus, PARTS, run="r", live=True,
                                           wait_for=wait_for, inbox=inbox)
 
     def until(self, wanted) -> list:

@@ -77,7 +77,7 @@ class Running:
 
         def run() -> None:
             bus = ZenohBus(self.listener.endpoint, world="test") if self.kind == "zenoh" else self.listener
-            self.health[service.name] = serve(service, core, bus, PARTS, run="r", source=service.name == "simulator",
+            self.health[service.name] = serve(service, core, bus, PARTS, run="r",
                                               wait_for=wait_for, inbox=inbox)
             if self.kind == "zenoh":
                 bus.close()

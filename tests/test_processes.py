@@ -20,6 +20,7 @@ NEEDS = {
 
 @pytest.mark.parametrize("name", NEEDS)
 def test_a_process_loads_what_its_service_needs_and_no_more(name):
-    code = f"import sys, services.{name}.__main__; print(*sorted({HEAVY} & set(sys.modules)))"
+    code = (f"import sys, saccade.services.{name}.core, saccade.shared.loop.main; "
+            f"print(*sorted({HEAVY} & set(sys.modules)))")
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert set(loaded.split()) <= NEEDS[name]

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from saccade.services.simulator.core import SERVICE, Simulator, build, names_in_use, scenes_of
-from saccade.services.simulator.objects import load_mesh
+from saccade.services.simulator.core import SERVICE, Simulator, build, scenes_of
+from saccade.services.simulator.objects import load_mesh, names_in_use
 from saccade.services.simulator.scenes import generate_scene, save_scenes
 from saccade.services.simulator.world import World
 from saccade.shared.bus.messages import Action

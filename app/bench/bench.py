@@ -24,7 +24,7 @@ from saccade.app.bench.suites import default_suite, suite_file
 from saccade.app.bench.workers import in_processes
 from saccade.app.provenance import machine, shown
 from saccade.app.run.registry import Pair, local_pairs, weight_hashes
-from saccade.services.simulator.core import names_in_use
+from saccade.services.simulator.objects import names_in_use
 from saccade.services.simulator.scenes import Scene, load_scenes
 from saccade.shared.bus.messages import Result
 from saccade.shared.bus.topics import RESULT

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from saccade.services.simulator.core import names_in_use
-from saccade.services.simulator.objects import load_mesh
+from saccade.services.simulator.objects import load_mesh, names_in_use
 from saccade.services.simulator.scenes import (
     PAPER_SCENES,
     Scene,

@@ -28,7 +28,7 @@ def train(*, objects: Objects = None, names: Names = None,
     """Train the networks of an object set; given again after an interruption, go on from there."""
     from rich.console import Console
 
-    from saccade.services.simulator.core import names_in_use
+    from saccade.services.simulator.objects import names_in_use
     from saccade.shared.config import WEIGHTS, SceneConfig
     from saccade.training.run import export
     from saccade.training.run import train as run_training

@@ -56,7 +56,7 @@ class Replay:
     @property
     def services(self) -> list[Service]:
         """Their declarations."""
-        return [service_of(name) for name in self.into]
+        return [service_of(name, self.config) for name in self.into]
 
 
 @dataclass
@@ -83,7 +83,7 @@ def prepare(log: Path, into: Sequence[str], values: dict, *, pace: Pace, topics:
     live = config.bus.live
     config = config.with_values({"run": run, "bus.wait_for": [], "bus.live": False, "bus.endpoint": "tcp/127.0.0.1:0",
                                  "bus.listen": None, "bus.first_step": max(start_step, cut)} | values)
-    services = [service_of(name) for name in ordered]
+    services = [service_of(name, config) for name in ordered]
     made = {topic.name for service in services for topic in service.outputs}
     wanted = {topic.name for service in services for topic in service.inputs} - made
     inputs = tuple(TOPICS[name] for name in sorted(wanted) if topics is None or TOPICS[name] in topics)

@@ -13,6 +13,7 @@ from saccade.app.run.threads import limit_torch
 from saccade.shared.bus.topics import TRUTH
 from saccade.shared.config import Config
 from saccade.shared.errors import SaccadeError
+from saccade.shared.loop.modules import SOURCES, load
 from saccade.shared.loop.service import Core, Service
 
 Pair = tuple[Service, Core]
@@ -45,11 +46,6 @@ class Agent:
     cores: tuple[str, ...] = ()
     weights: bool = True  # whether it needs trained ones
 
-    @property
-    def modules(self) -> tuple[str, ...]:
-        """The modules that hold SERVICE and build, in the order of the data."""
-        return tuple(f"saccade.services.{name}.core" for name in self.services) + self.cores
-
 
 AGENTS = {
     "sceneccn": Agent(services=("perception", "belief", "planner")),
@@ -73,7 +69,8 @@ def world_of(name: str) -> World:
 
 def agent_pairs(agent: str, config: Config) -> list[Pair]:
     """Declarations and cores of an agent, built for a configuration whose objects are named."""
-    return [_pair(module, config) for module in agent_of(agent).modules]
+    chosen = agent_of(agent)
+    return pairs_of(chosen.services, config) + [_core(module, config) for module in chosen.cores]
 
 
 def local_pairs(agent: str, config: Config, world: str = DEFAULT_WORLD) -> list[Pair]:
@@ -84,7 +81,7 @@ def local_pairs(agent: str, config: Config, world: str = DEFAULT_WORLD) -> list[
     """
     limit_torch()
     chosen = world_of(world)
-    source, *judges = (_pair(f"saccade.services.{name}.core", config) for name in (chosen.source, *chosen.judges))
+    source, *judges = pairs_of((chosen.source, *chosen.judges), config)
     agents = agent_pairs(agent, config)
     if TRUTH not in source[0].outputs and any(TRUTH in service.inputs for service, _ in agents):
         raise SaccadeError(f"agent {agent!r} must be told the truth, which the world {world!r} does not know: choose "
@@ -116,17 +113,26 @@ def weight_hashes(agent: str, config: Config) -> dict[str, str]:
     return dict(sorted(weights.hashes.items()))
 
 
-def service_of(name: str) -> Service:
-    """The declaration of a service of ours."""
-    return import_module(f"saccade.services.{name}.core").SERVICE
+def service_of(name: str, config: Config | None = None) -> Service:
+    """The declaration of a service of a run, or of ours."""
+    return load(name, config or Config()).service
 
 
 def pairs_of(names: Sequence[str], config: Config) -> list[Pair]:
-    """Declarations and cores of services of ours, built for a configuration whose objects are named."""
+    """Declarations and cores of services, built for a configuration whose objects are named. Raises SaccadeError for a
+    module from outside that is none."""
     limit_torch()
-    return [_pair(f"saccade.services.{name}.core", config) for name in names]
+    modules = [load(name, config) for name in names]
+    return [(module.service, module.build(config)) for module in modules]
 
 
-def _pair(module_name: str, config: Config) -> Pair:
+def require_services(agent: str, config: Config, world: str) -> None:
+    """Raises SaccadeError for a module from outside that is none: before any process starts."""
+    for name in (world_of(world).source, *agent_of(agent).services):
+        if getattr(config.services, "source" if name in SOURCES else name) is not None:
+            load(name, config)
+
+
+def _core(module_name: str, config: Config) -> Pair:
     module = import_module(module_name)
     return module.SERVICE, module.build(config)

@@ -15,13 +15,13 @@ from rich.console import Console
 
 from saccade.app.run.display import Display, say
 from saccade.app.run.launch import launched
-from saccade.app.run.registry import DEFAULT_WORLD, agent_of, agent_processes, local_pairs, world_of
+from saccade.app.run.registry import DEFAULT_WORLD, agent_of, agent_processes, local_pairs, require_services, world_of
 from saccade.app.run.summary import summary
 from saccade.app.run.supervisor import VIEWER
 from saccade.services.camera.core import build as build_camera
 from saccade.services.camera.sources import absolute, webcam_number
 from saccade.services.recorder.core import describe
-from saccade.services.simulator.core import names_in_use
+from saccade.services.simulator.objects import names_in_use
 from saccade.services.viewer.server import binary, url_of, with_free_ports
 from saccade.shared.bus.messages import Message, Result
 from saccade.shared.bus.topics import Topic
@@ -52,6 +52,7 @@ def run(config: Config, *, agent: str, out: Path | None, plain: bool, console: C
     over and its viewer still there; a run that was interrupted has none."""
     console, place = console or Console(), world_of(world)
     config = resolve(in_world(config, world))
+    require_services(agent, config, world)
     require_weights(agent, config)
     if view:
         config = to_be_viewed(config)
@@ -104,8 +105,9 @@ def in_world(config: Config, world: str) -> Config:
                            "and --count out")
     config = config.with_values({"scene.explore": scene.explore or scene.goal_image is None,
                                  "bus.live": config.bus.kind == "zenoh"})
-    if camera.source is None or webcam_number(camera.source) is None:  # a webcam would be switched on and off
-        build_camera(config)
+    from_outside = config.services.source is not None
+    if not from_outside and (camera.source is None or webcam_number(camera.source) is None):
+        build_camera(config)  # but for a webcam, which would be switched on and off
     return config
 
 

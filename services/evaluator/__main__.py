@@ -1,7 +1,5 @@
-"""`python -m saccade.services.evaluator`: the evaluator as a process."""
+"""`python -m saccade.services.evaluator --config FILE`: the truth in, results out."""
 
-from saccade.services.evaluator.core import SERVICE, build
 from saccade.shared.loop.main import main
 
-if __name__ == "__main__":
-    main(SERVICE, build)
+main("evaluator")

@@ -1,7 +1,5 @@
-"""`python -m saccade.services.simulator`: the simulator as a process."""
+"""`python -m saccade.services.simulator --config FILE`: actions in, frames and the truth out."""
 
-from saccade.services.simulator.core import SERVICE, build
 from saccade.shared.loop.main import main
 
-if __name__ == "__main__":
-    main(SERVICE, build, source=True)
+main("simulator")

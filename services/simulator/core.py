@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
 
-from saccade.services.simulator.objects import load_mesh, names_of
+from saccade.services.simulator.objects import load_mesh, names_in_use
 from saccade.services.simulator.scenes import Placed, Scene, Sizes, generate_scene, load_scenes
 from saccade.services.simulator.world import World
 from saccade.shared.bus.messages import Frame, Goal, Truth
 from saccade.shared.bus.topics import ACTION, FRAME, GOAL, RESULT, TRUTH, Output
-from saccade.shared.config import Config, SceneConfig
+from saccade.shared.config import Config
 from saccade.shared.errors import SaccadeError
 from saccade.shared.loop.seeding import generator
 from saccade.shared.loop.service import Inputs, Service
@@ -21,6 +21,14 @@ from saccade.shared.world.images import read_goal_image
 from saccade.shared.world.task import MAX_STEPS, Episode, spheres_around
 
 SERVICE = Service("simulator", inputs=(ACTION,), trigger=ACTION, outputs=(FRAME, GOAL, TRUTH), closed_by=RESULT)
+
+
+class At(TypedDict):
+    """Where in a run a message belongs."""
+
+    run: str
+    episode: int
+    step: int
 
 
 class Simulator:
@@ -66,7 +74,7 @@ class Simulator:
         self.state.act(action.translation_m, action.rotation_rad, arrived=action.arrived)
         return self._outputs()
 
-    def _stamp(self) -> dict[str, str | int]:
+    def _stamp(self) -> At:
         return {"run": self._run, "episode": self._episode, "step": self.state.step}
 
     def _place(self, objects: Sequence[Placed]) -> None:
@@ -99,18 +107,6 @@ class Simulator:
                      target_center_m=scene.target_placed.center_m, world_from_camera=state.camera,
                      goal_world_from_camera=state.goal, success=state.reached, done=state.done,
                      declared=state.declared, declared_true=state.declared_true)
-
-
-def names_in_use(config: SceneConfig) -> tuple[str, ...]:
-    """The objects of the set, or the configured subset. Raises SaccadeError for a name that the set does not have."""
-    available = names_of(config.objects)
-    for name in config.names or ():
-        if name not in available:
-            choice = ", ".join(available)
-            raise SaccadeError(f"scene.names: {name!r} is not in {config.objects!r}: choose from {choice}")
-    if config.names is not None and (not config.names or len(set(config.names)) < len(config.names)):
-        raise SaccadeError("scene.names: name at least one object, each once")
-    return config.names or available
 
 
 def scenes_of(config: Config, sizes: Sizes) -> list[Scene]:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from saccade.services.simulator.mesh import Mesh, read_obj
 from saccade.services.simulator.pantry import PANTRY_NAMES, make_mesh
+from saccade.shared.config import SceneConfig
 from saccade.shared.errors import SaccadeError
 
 YCB_NAMES = ("002_master_chef_can", "003_cracker_box", "004_sugar_box", "005_tomato_soup_can", "006_mustard_bottle")
@@ -37,3 +38,15 @@ def load_mesh(object_set: str, name: str) -> Mesh:
     if object_set == "ycb":
         return read_obj(ycb_folder() / name, name)
     return make_mesh(name)
+
+
+def names_in_use(config: SceneConfig) -> tuple[str, ...]:
+    """The objects of the set, or the configured subset. Raises SaccadeError for a name that the set does not have."""
+    available = names_of(config.objects)
+    for name in config.names or ():
+        if name not in available:
+            choice = ", ".join(available)
+            raise SaccadeError(f"scene.names: {name!r} is not in {config.objects!r}: choose from {choice}")
+    if config.names is not None and (not config.names or len(set(config.names)) < len(config.names)):
+        raise SaccadeError("scene.names: name at least one object, each once")
+    return config.names or available

@@ -18,37 +18,51 @@ OnMessage = Callable[[Topic, str | None, Message, bytes | None], None]
 OnStep = Callable[[str, float], None]
 
 
+class Pump:
+    """Brings messages from core to core within this process, in the order of publication.
+
+    `on_message(topic, part, message, payload)` sees every message; payload is its wire bytes if `encoded`, else None,
+    and messages pass as they are. `on_step(service, milliseconds)` is told what each step of a core took.
+    """
+
+    def __init__(self, steppers: Sequence[Stepper], on_message: OnMessage | None = None, *, encoded: bool = False,
+                 on_step: OnStep | None = None) -> None:
+        self._steppers, self._on_message, self._encoded, self._on_step = steppers, on_message, encoded, on_step
+
+    def run(self, outputs: Iterable[Output]) -> None:
+        """Passes on these and all that follows from them, until nobody has anything more to say."""
+        waiting = deque(outputs)
+        while waiting:
+            output = waiting.popleft()
+            message = settle(output.message)
+            if self._on_message is not None:
+                self._on_message(output.topic, output.part, message, encode(message) if self._encoded else None)
+            for stepper in self._steppers:
+                if output.topic not in stepper.service.inputs:
+                    continue
+                stepper.offer(output.topic, output.part, message)
+                while (made := _advance(stepper, self._on_step)) is not None:
+                    waiting.extend(made)
+
+
 def run_local(pairs: Sequence[tuple[Service, Core]], parts: tuple[str, ...], run_id: str,
               episodes: Iterable[int] | None = None, on_message: OnMessage | None = None, *, encoded: bool = False,
               on_step: OnStep | None = None) -> None:
     """Runs the cores in this process: those episodes of the source (the core with `episodes`), in rising order; or all.
 
-    `on_message(topic, part, message, payload)` sees every message in the order of publication; payload is its wire
-    bytes if `encoded`, else None, and messages pass as they are. A source that goes by time is not hurried: its next
-    frame comes when the one before it has been worked off. `on_step(service, milliseconds)` is told what each
-    step of a core took. Raises SaccadeError if a step lacks an input for good.
+    A source that goes by time is not hurried: its next frame comes when the one before it has been worked off. See
+    `Pump` for `on_message`, `encoded` and `on_step`. Raises SaccadeError if a step lacks an input for good.
     """
     sources = [Stepper(s, c, parts, source=True) for s, c in pairs if hasattr(c, "episodes")]
     if len(sources) != 1:
         raise SaccadeError(f"a run needs one source, not {len(sources)}: {', '.join(s.name for s, _ in pairs)}")
     source = sources[0]
     steppers = [source if c is source.core else Stepper(s, c, parts) for s, c in pairs]
+    pump = Pump(steppers, on_message, encoded=encoded, on_step=on_step)
     for episode in range(source.core.episodes) if episodes is None else episodes:
-        waiting = deque(source.begin(run_id, episode))
-        while waiting or (source.timed and not source.episode_done):
-            if not waiting:  # the frame before it has been worked off
-                waiting.extend(source.tick())
-                continue
-            output = waiting.popleft()
-            message = settle(output.message)
-            if on_message is not None:
-                on_message(output.topic, output.part, message, encode(message) if encoded else None)
-            for stepper in steppers:
-                if output.topic not in stepper.service.inputs:
-                    continue
-                stepper.offer(output.topic, output.part, message)
-                while (outputs := _advance(stepper, on_step)) is not None:
-                    waiting.extend(outputs)
+        pump.run(source.begin(run_id, episode))
+        while source.timed and not source.episode_done:
+            pump.run(source.tick())
         if not source.episode_done:
             lacks = [f"{s.service.name} {WAITS}{', '.join(s.waits_for())}" for s in steppers if s.waits_for()]
             raise SaccadeError(f"episode {episode} came to a halt: {'; '.join(lacks) or 'nobody has anything to do'}")

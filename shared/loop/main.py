@@ -17,6 +17,7 @@ from saccade.shared.bus.transport import Bus, ZenohBus
 from saccade.shared.bus.wire import MessageError, decode, encode, stamp_of
 from saccade.shared.config import Config
 from saccade.shared.errors import SaccadeError
+from saccade.shared.loop.modules import ServiceModule, load
 from saccade.shared.loop.process import DRAIN_S, Health, Heartbeat, Inbox, run_process
 from saccade.shared.loop.replicas import JOIN_S, MEET_S, Share, alone_on
 from saccade.shared.loop.service import Core, Service
@@ -28,38 +29,46 @@ IDLE_S = 1.0  # after so long without a message a service asks for what it lacks
 WAITS = "waits for "
 
 
-def main(service: Service, build: Callable[[Config], Core], *, source: bool = False,
-         parts: tuple[str, ...] | None = None, argv: Sequence[str] | None = None) -> None:
+def main(name: str, argv: Sequence[str] | None = None) -> None:
     """A service's whole process: `--config RUN/config.json`, then messages in, messages out, until SIGTERM.
 
-    `parts` are the objects' names, those of the configuration unless given. A `source` begins its episodes itself,
-    the first once every service in `bus.wait_for` is ready; one that goes by time publishes a frame a period. Bad
-    input ends the process with one line and code 2.
+    It is the service of that name: ours, or the one from outside that the configuration puts in its place. Bad input
+    ends the process with one line and code 2.
     """
-
     def work(config: Config, folder: Path, inbox: Inbox) -> None:
-        names = parts if parts is not None else config.names
-        core = build(config)
-        bus = ZenohBus(config.bus.endpoint, world=config.bus.world)
-        try:
-            serve(service, core, bus, names, run=config.run or folder.name, source=source,
-                  wait_for=config.bus.wait_for, inbox=inbox, live=config.bus.live, first_step=config.bus.first_step)
-        finally:
-            bus.close()
+        _work(load(name, config, compare=False), config, folder, inbox)
 
-    run_process(service.name, work, argv=argv)
+    run_process(name, work, argv=argv)
 
 
-def serve(service: Service, core: Core, bus: Bus, parts: tuple[str, ...], *, run: str, source: bool = False,
+def run_module(module: ServiceModule, argv: Sequence[str] | None = None) -> None:
+    """`main` for a service that the configuration does not name."""
+    run_process(module.service.name, lambda config, folder, inbox: _work(module, config, folder, inbox), argv=argv)
+
+
+def _work(module: ServiceModule, config: Config, folder: Path, inbox: Inbox) -> None:
+    core = module.build(config)
+    bus = ZenohBus(config.bus.endpoint, world=config.bus.world)
+    try:
+        serve(module.service, core, bus, config.names, run=config.run or folder.name,
+              wait_for=config.bus.wait_for, inbox=inbox, live=config.bus.live, first_step=config.bus.first_step)
+    finally:
+        bus.close()
+
+
+def serve(service: Service, core: Core, bus: Bus, parts: tuple[str, ...], *, run: str,
           wait_for: tuple[str, ...] = (), inbox: Inbox | None = None, live: bool = False,
           first_step: int = 0) -> Health:
     """Runs a core on a bus until `inbox` is stopped; returns what it counted.
+
+    A source, whose core has `episodes`, begins them itself, the first once every service in `wait_for` is ready; one
+    that goes by time publishes a frame a period.
 
     What was published before this service was there, or while it or the router was away, is asked for: at the start,
     and whenever nothing comes. So a service that is started again folds the episode so far and goes on. `live`, it
     goes on with the newest.
     """
-    inbox = inbox or Inbox()
+    inbox, source = inbox or Inbox(), hasattr(core, "episodes")
     stepper = Stepper(service, core, parts, source=source, live=live, first_step=first_step)
     loop = _Loop(stepper, bus, run, wait_for if source else (), live=live)
     bus.answer(service.outputs, loop.outbox.answer)

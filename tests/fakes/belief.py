@@ -1,7 +1,6 @@
 """python -m saccade.tests.fakes.belief --config FILE"""
 
-from saccade.shared.loop.main import main
-from saccade.tests.fakes.services import SERVICES, build
+from saccade.shared.loop.main import run_module
+from saccade.tests.fakes.services import module
 
-if __name__ == "__main__":
-    main(SERVICES["belief"], lambda config: build("belief", config))
+run_module(module("belief"))

@@ -1,7 +1,6 @@
 """python -m saccade.tests.fakes.planner --config FILE"""
 
-from saccade.shared.loop.main import main
-from saccade.tests.fakes.services import SERVICES, build
+from saccade.shared.loop.main import run_module
+from saccade.tests.fakes.services import module
 
-if __name__ == "__main__":
-    main(SERVICES["planner"], lambda config: build("planner", config))
+run_module(module("planner"))

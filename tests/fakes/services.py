@@ -12,6 +12,7 @@ from saccade.shared.bus.messages import Action, Belief, Frame, Goal, Percept, Pl
 from saccade.shared.bus.topics import ACTION, BELIEF, FRAME, GOAL, GOAL_PERCEPT, PERCEPT, PLAN, RESULT, TRUTH, Output
 from saccade.shared.config import Config
 from saccade.shared.errors import SaccadeError
+from saccade.shared.loop.modules import ServiceModule
 from saccade.shared.loop.seeding import generator
 from saccade.shared.loop.service import Inputs, Service
 
@@ -165,3 +166,8 @@ SERVICES = {s.name: s for s in (SIMULATOR, PERCEPTION, BELIEVER, PLANNER, EVALUA
 def pairs(config: Config) -> list:
     """Every fake service with its core, for a run in one process."""
     return [(service, build(name, config)) for name, service in SERVICES.items()]
+
+
+def module(name: str) -> ServiceModule:
+    """A fake service as a process runs it."""
+    return ServiceModule(SERVICES[name], lambda config: build(name, config))

@@ -1,7 +1,6 @@
 """python -m saccade.tests.fakes.simulator --config FILE"""
 
-from saccade.shared.loop.main import main
-from saccade.tests.fakes.services import SERVICES, build
+from saccade.shared.loop.main import run_module
+from saccade.tests.fakes.services import module
 
-if __name__ == "__main__":
-    main(SERVICES["simulator"], lambda config: build("simulator", config), source=True)
+run_module(module("simulator"))

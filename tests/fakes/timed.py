@@ -6,7 +6,8 @@ import numpy as np
 
 from saccade.shared.bus.messages import Frame, Goal
 from saccade.shared.bus.topics import ACTION, FRAME, GOAL, Output
-from saccade.shared.loop.main import main
+from saccade.shared.loop.main import run_module
+from saccade.shared.loop.modules import ServiceModule
 from saccade.shared.loop.service import Service
 from saccade.tests.fakes.services import IDENTITY, INTRINSICS_PX
 
@@ -40,4 +41,4 @@ class FakeCamera:
 
 
 if __name__ == "__main__":
-    main(TIMED, lambda config: FakeCamera(config.simulator.max_steps, 0.03), source=True)
+    run_module(ServiceModule(TIMED, lambda config: FakeCamera(config.simulator.max_steps, 0.03)))

@@ -1,0 +1,222 @@
+"""A log as episodes of steps, for whoever reads runs from Python: `for episode in log: for step in episode`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from saccade.app.log.source import log_of
+from saccade.shared.bus.messages import Action, Belief, Frame, Goal, Percept, Plan, Result, Truth
+from saccade.shared.bus.topics import (
+    ACTION,
+    BELIEF,
+    FRAME,
+    GOAL,
+    GOAL_PERCEPT,
+    PERCEPT,
+    PLAN,
+    RESULT,
+    STATUS,
+    TRUTH,
+    Topic,
+)
+from saccade.shared.bus.wire import MessageError, Stamp, decode, stamp_of
+from saccade.shared.config import Config, validate
+from saccade.shared.errors import SaccadeError
+from saccade.shared.log.reading import RunReader
+
+WINDOW = 64  # steps that are kept open: a recorder that was restarted logs what it missed later
+
+Entries = dict[tuple[Topic, str | None], bytes]
+
+
+class _Messages:
+    """Messages of one step or one episode, decoded when they are asked for. One that is no valid message counts as
+    missing."""
+
+    def __init__(self) -> None:
+        self._entries: Entries = {}
+        self._decoded: dict[tuple[Topic, str | None], Any] = {}
+
+    def _put(self, topic: Topic, part: str | None, payload: bytes) -> None:
+        self._entries.setdefault((topic, part), payload)
+
+    def _get(self, topic: Topic, part: str | None = None) -> Any:
+        key = topic, part
+        if key not in self._decoded:
+            self._decoded[key] = None
+            if key in self._entries:
+                with suppress(MessageError):
+                    self._decoded[key] = decode(topic.type, self._entries[key])
+        return self._decoded[key]
+
+    def _by_part(self, topic: Topic) -> dict[str, Any]:
+        found = {part: self._get(topic, part) for at, part in self._entries if at == topic and part is not None}
+        return {part: message for part, message in sorted(found.items()) if message is not None}
+
+
+class Step(_Messages):
+    """Everything that was said about one step. What the log lacks is None, or missing from the mapping."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__()
+        self.number = number
+
+    @property
+    def frame(self) -> Frame | None:
+        """What the camera saw."""
+        return self._get(FRAME)
+
+    @cached_property
+    def percepts(self) -> Mapping[str, Percept]:
+        """What each object's networks made of the frame, by the object's name."""
+        return self._by_part(PERCEPT)
+
+    @cached_property
+    def beliefs(self) -> Mapping[str, Belief]:
+        """What is believed about each object after the frame, by the object's name."""
+        return self._by_part(BELIEF)
+
+    @property
+    def plan(self) -> Plan | None:
+        """The chosen viewpoint and the terms of its expected free energy."""
+        return self._get(PLAN)
+
+    @property
+    def action(self) -> Action | None:
+        """The move that followed."""
+        return self._get(ACTION)
+
+    @property
+    def truth(self) -> Truth | None:
+        """The simulator's ground truth; a real camera has none."""
+        return self._get(TRUTH)
+
+    def __repr__(self) -> str:
+        return f"<Step {self.number}: {', '.join(sorted({topic.name for topic, _ in self._entries}))}>"
+
+
+class Episode(_Messages):
+    """One episode. Iterating gives its steps in order, once."""
+
+    def __init__(self, number: int, steps: Iterator[Step]) -> None:
+        super().__init__()
+        self.number, self._steps = number, steps
+
+    def __iter__(self) -> Iterator[Step]:
+        return self._steps
+
+    @property
+    def goal(self) -> Goal | None:
+        """The image that the agent was to reach; known from the first step on."""
+        return self._get(GOAL)
+
+    @cached_property
+    def goal_percepts(self) -> Mapping[str, Percept]:
+        """What each object's networks made of the goal image; known from the first step on."""
+        return self._by_part(GOAL_PERCEPT)
+
+    @property
+    def result(self) -> Result | None:
+        """How the episode ended; known when its steps have been read."""
+        for _ in self._steps:
+            pass
+        return self._get(RESULT)
+
+    def __repr__(self) -> str:
+        return f"<Episode {self.number}>"
+
+
+class Log:
+    """A run's log. Iterating reads the file once, from its start, and gives its episodes in order. An episode has to be
+    read before the next one is asked for; what was not read of it is passed over."""
+
+    def __init__(self, path: str | Path) -> None:
+        """`path`: the folder of a run, or its log. Raises SaccadeError for what is no log."""
+        self.path = log_of(Path(path))
+        self._reader = RunReader(self.path)
+
+    @cached_property
+    def config(self) -> Config:
+        """The run's resolved configuration. Raises SaccadeError where the log holds none."""
+        if self._reader.configuration is None:
+            next(RunReader.entries(self._reader), None)  # it stands before the first message
+        if self._reader.configuration is None:
+            raise SaccadeError(f"log {self.path} holds no configuration")
+        return validate(json.loads(self._reader.configuration), f"the log {self.path}")
+
+    @property
+    def objects(self) -> tuple[str, ...]:
+        """The objects that the agent knew."""
+        return self.config.names
+
+    def __iter__(self) -> Iterator[Episode]:
+        entries = _Entries(self.path)
+        while (number := entries.episode) is not None:
+            episode = Episode(number, iter(()))
+            steps = _steps(entries, episode)
+            first = next(steps, None)  # with it the goal is known
+            episode._steps = _chain(first, steps)
+            yield episode
+            for _ in episode._steps:
+                pass
+
+    def __repr__(self) -> str:
+        return f"<Log {self.path}>"
+
+
+class _Entries:
+    """The entries of a log, with a look at the next one."""
+
+    def __init__(self, path: Path) -> None:
+        self._entries = RunReader(path).entries()
+        self.next: tuple[Topic, str | None, bytes, Stamp] | None = None
+        self.advance()
+
+    @property
+    def episode(self) -> int | None:
+        """That of the next entry; None at the end."""
+        return self.next[3].episode if self.next else None
+
+    def advance(self) -> None:
+        """Passes the next entry. What has no stamp is no message, a status belongs to no step, and what comes when the
+        next episode has begun is too late."""
+        last, self.next = self.next, None
+        for entry in self._entries:
+            if entry.topic == STATUS:
+                continue
+            try:
+                stamp = stamp_of(entry.payload)
+            except MessageError:
+                continue
+            if last is None or stamp.episode >= last[3].episode:
+                self.next = entry.topic, entry.part, entry.payload, stamp
+                return
+
+
+def _steps(entries: _Entries, episode: Episode) -> Iterator[Step]:
+    """The steps of an episode in order; its latched messages go to the episode itself."""
+    waiting: dict[int, Step] = {}
+    given = -1
+    while entries.next is not None and entries.episode == episode.number:
+        topic, part, payload, stamp = entries.next
+        if topic.latched:
+            episode._put(topic, part, payload)
+        elif stamp.step > given:
+            waiting.setdefault(stamp.step, Step(stamp.step))._put(topic, part, payload)
+        entries.advance()
+        while waiting and min(waiting) <= stamp.step - WINDOW:
+            given = min(waiting)
+            yield waiting.pop(given)
+    for number in sorted(waiting):
+        yield waiting[number]
+
+
+def _chain(first: Step | None, rest: Iterator[Step]) -> Iterator[Step]:
+    if first is not None:
+        yield first
+    yield from rest

@@ -1,0 +1,114 @@
+"""An agent within this process, for a robot or a simulator of one's own: images and poses in, actions out, no bus."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from saccade.app.run.registry import agent_pairs
+from saccade.services.camera.virtual_camera import VirtualCamera
+from saccade.services.simulator.objects import names_in_use
+from saccade.shared.bus.messages import Action, Belief, Frame, Goal, Message, Percept, Plan
+from saccade.shared.bus.topics import ACTION, BELIEF, FRAME, GOAL, GOAL_PERCEPT, PERCEPT, PLAN, Output, Topic
+from saccade.shared.config import Config
+from saccade.shared.errors import SaccadeError
+from saccade.shared.loop.local import Pump
+from saccade.shared.loop.stepper import Stepper
+from saccade.shared.world.geometry import IMAGE_SIZE_PX, INTRINSICS_PX
+from saccade.shared.world.images import read_image
+
+Image = NDArray[np.uint8]
+RUN = "agent"
+ORTHONORMAL = 1e-3  # how far a rotation's columns may be from unit vectors at right angles
+
+
+class Agent:
+    """Perception, belief and planner of a configuration, stepped by whoever owns the camera.
+
+    `goal`: the image to reach, a file or an array [H, W, 3] of bytes; without one the agent explores. `intrinsics`:
+    (fx, fy, cx, cy) of your images in pixels; without them images of 480x480 pixels are taken as the training's
+    camera's, and of others the central square. Raises SaccadeError for a configuration or a goal that cannot be used.
+    """
+
+    def __init__(self, config: Config, *, agent: str = "sceneccn", goal: str | Path | ArrayLike | None = None,
+                 intrinsics: Sequence[float] | None = None) -> None:
+        self.intrinsics, self._agent = intrinsics, agent
+        self.config = config.with_values({"scene.names": list(names_in_use(config.scene)), "bus.kind": "local",
+                                          "scene.explore": goal is None})
+        self._pairs = agent_pairs(agent, self.config)
+        self._episode = -1
+        self.reset(goal)
+
+    def reset(self, goal: str | Path | ArrayLike | None = None) -> None:
+        """A new scene, about which nothing is known yet, and a new goal image."""
+        if (goal is None) != self.config.scene.explore:
+            self.config = self.config.with_values({"scene.explore": goal is None})
+            self._pairs = agent_pairs(self._agent, self.config)
+        rgb = None if goal is None else self._as_trained(image_of(goal, "goal image"))
+        self._episode, self._step = self._episode + 1, 0
+        self.percepts: dict[str, Percept] = {}
+        self.goal_percepts: dict[str, Percept] = {}
+        self.beliefs: dict[str, Belief] = {}
+        self.plan: Plan | None = None
+        self._action: Action | None = None
+        self._pump = Pump([Stepper(service, core, self.config.names) for service, core in self._pairs], self._take)
+        self._goal = Goal(run=RUN, episode=self._episode, step=0, rgb=rgb, intrinsics_px=np.array(INTRINSICS_PX))
+
+    def step(self, rgb: ArrayLike, world_from_camera: ArrayLike,
+             intrinsics: Sequence[float] | None = None) -> Action:
+        """The next move, from an image [H, W, 3] of bytes and the camera's pose [4, 4] (metres; OpenGL: the camera
+        looks along its -z, +y is up).
+
+        `intrinsics`: of this image, where they are not those of all images. Raises SaccadeError for an image or a pose
+        that is none.
+        """
+        image = self._as_trained(image_of(rgb, "image"), intrinsics)
+        frame = Frame(run=RUN, episode=self._episode, step=self._step, seq=self._step, rgb=image,
+                      intrinsics_px=np.array(INTRINSICS_PX), world_from_camera=_pose(world_from_camera))
+        self._action = None
+        first = [Output(GOAL, self._goal)] if self._step == 0 else []
+        self._pump.run([*first, Output(FRAME, frame)])
+        self._step += 1
+        if self._action is None:
+            raise SaccadeError("the agent did not answer this image: one of its services needs other inputs")
+        return self._action
+
+    def _take(self, topic: Topic, part: str | None, message: Message, payload: bytes | None) -> None:
+        if topic == PLAN and isinstance(message, Plan):
+            self.plan = message
+        elif topic == ACTION and isinstance(message, Action):
+            self._action = message
+        elif part is not None:
+            kept: Mapping[Topic, dict] = {PERCEPT: self.percepts, GOAL_PERCEPT: self.goal_percepts,
+                                          BELIEF: self.beliefs}
+            if topic in kept:
+                kept[topic][part] = message
+
+    def _as_trained(self, rgb: Image, intrinsics: Sequence[float] | None = None) -> Image:
+        """The image as the camera of the training would have seen it from the same pose."""
+        intrinsics = self.intrinsics if intrinsics is None else intrinsics
+        if intrinsics is None and rgb.shape == (IMAGE_SIZE_PX, IMAGE_SIZE_PX, 3):
+            return rgb
+        return VirtualCamera((rgb.shape[1], rgb.shape[0]), intrinsics).see(rgb)
+
+
+def image_of(given: str | Path | ArrayLike, what: str) -> Image:
+    if isinstance(given, (str, Path)):
+        return read_image(Path(given), what=what)
+    rgb = np.asarray(given)
+    if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8:
+        raise SaccadeError(f"{what} of shape {list(rgb.shape)} and type {rgb.dtype}: give [height, width, 3] of uint8")
+    return np.ascontiguousarray(rgb)
+
+
+def _pose(given: ArrayLike) -> NDArray[np.float64]:
+    pose = np.array(given, dtype=np.float64)
+    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+        raise SaccadeError(f"world_from_camera of shape {list(pose.shape)}: give 4x4 finite numbers")
+    rotation = pose[:3, :3]
+    if np.abs(rotation.T @ rotation - np.eye(3)).max() > ORTHONORMAL or np.linalg.det(rotation) < 0:
+        raise SaccadeError("world_from_camera: its upper left 3x3 numbers are no rotation")
+    return pose

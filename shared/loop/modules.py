@@ -1,0 +1,71 @@
+"""Which module a service of a run is: one of ours, or one from outside that the configuration puts in its place."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from importlib import import_module
+from typing import NamedTuple
+
+from saccade.shared.bus.topics import Topic
+from saccade.shared.config import Config
+from saccade.shared.errors import SaccadeError
+from saccade.shared.loop.service import Core, Service
+
+SOURCES = ("simulator", "camera")  # a run has one of them, in whose place `services.source` stands
+EXAMPLE = "see examples/greedy_planner"
+
+
+class ServiceModule(NamedTuple):
+    """A service's declaration, and what builds its core."""
+
+    service: Service
+    build: Callable[[Config], Core]
+
+
+def load(name: str, config: Config, *, compare: bool = True) -> ServiceModule:
+    """The service of that name in a run.
+
+    Raises SaccadeError where the configuration names a module that cannot be imported, that declares no SERVICE or
+    builds no core, or that says other things than the service in whose place it stands. Not to `compare` spares a
+    process from importing ours, once it is known that they agree.
+    """
+    ours = f"saccade.services.{name}.core"
+    key = f"services.{'source' if name in SOURCES else name}"
+    chosen = getattr(config.services, key.partition(".")[2], None)
+    if chosen is None:
+        module = import_module(ours)
+        return ServiceModule(module.SERVICE, module.build)
+    told = f"{key}: module {chosen!r}"
+    try:
+        module = import_module(chosen)
+    except Exception as error:  # whatever a module from outside does as it is imported
+        why = re.sub(r"\s+", " ", str(error)) or type(error).__name__
+        raise SaccadeError(f"{told} cannot be imported ({why}): install it, or put its folder on PYTHONPATH") from error
+    service, build = getattr(module, "SERVICE", None), getattr(module, "build", None)
+    if not isinstance(service, Service):
+        raise SaccadeError(f"{told} declares no SERVICE (a saccade.shared.loop.service.Service): {EXAMPLE}")
+    if not callable(build):
+        raise SaccadeError(f"{told} has no build(config) that makes its core: {EXAMPLE}")
+    if compare:
+        _require_alike(told, service, import_module(ours).SERVICE)
+    return ServiceModule(service, build)
+
+
+def _require_alike(told: str, service: Service, ours: Service) -> None:
+    """What others rely on: the name by which they know it, what it says, and how its episodes end."""
+    if service.name != ours.name:
+        raise SaccadeError(f"{told} calls itself {service.name!r}: it stands in the place of {ours.name!r}, call it so")
+    if set(service.outputs) != set(ours.outputs):
+        raise SaccadeError(f"{told} declares the outputs {_names(service.outputs)}: the {ours.name} has "
+                           f"{_names(ours.outputs)}")
+    if service.trigger not in service.inputs:
+        raise SaccadeError(f"{told} declares the trigger {service.trigger.name}, which is none of its inputs "
+                           f"{_names(service.inputs)}")
+    if service.closed_by != ours.closed_by:
+        raise SaccadeError(f"{told} must declare closed_by {ours.closed_by and ours.closed_by.name}, as the "
+                           f"{ours.name} does")
+
+
+def _names(topics: tuple[Topic, ...]) -> str:
+    return ", ".join(sorted(topic.name for topic in topics)) or "none"
