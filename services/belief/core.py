@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,16 @@ Moments = tuple[NDArray[np.float64], NDArray[np.float64]]  # mean [3], covarianc
 
 WORTH_COMPARING = 0.05  # chosen: goal presence below which an object's pose is not compared with the goal
 LOCALISED_M = 0.08  # chosen: deviation below which a view's displacement around the object means something
+
+
+class Energy(TypedDict, total=False):
+    """Those terms of F that a step has, as a belief names them."""
+
+    f_identity: float
+    f_position: float
+    f_crop: float
+    f_likelihood: float
+    f_pose: float
 
 
 class BeliefFilter:
@@ -72,9 +83,14 @@ class BeliefFilter:
             position.missed(visible, rng)
         mean, covariance = position.moments()
         goal_view = self.goal_views.get(name)
-        if goal_view and name in present and np.trace(covariance) < LOCALISED_M ** 2:
-            goal_view.seen(percept, mean)
-        posterior = goal_view.log_posterior() if goal_view else None
+        posterior, goal_range_m, goal_here = None, 0.0, 0.0
+        if goal_view is not None:
+            if name in present and np.trace(covariance) < LOCALISED_M ** 2:
+                goal_view.seen(percept, mean)
+            posterior = goal_view.log_posterior()
+            if posterior is not None:
+                goal_range_m = goal_view.range_m(posterior)
+                goal_here = goal_view.here(percept) if name in present else 0.0
         energy = self._free_energy(percept, prior, before, (mean, covariance), name in present)
         return Belief(
             run=percept.run, episode=percept.episode, step=percept.step, object=name, presence=position.presence,
@@ -82,13 +98,13 @@ class BeliefFilter:
             particles_m=position.sample(self.config.belief.published_particles, rng).astype(np.float32),
             views=len(goal_view.keyframes) if goal_view else 0,
             goal_log_posterior=None if posterior is None else posterior.astype(np.float32),
-            goal_range_m=0.0 if posterior is None else goal_view.range_m(posterior),
-            goal_here=goal_view.here(percept) if posterior is not None and name in present else 0.0, **energy)
+            goal_range_m=goal_range_m, goal_here=goal_here, **energy)
 
     def _free_energy(self, percept: Percept, prior: float, before: Moments, after: Moments,
-                     present: bool) -> dict[str, float]:
+                     present: bool) -> Energy:
         """The terms of F; those of an object that is not seen are what its absence says."""
-        terms = {"f_identity": identity_term(percept.presence, prior), "f_position": position_term(before, after)}
+        terms: Energy = {"f_identity": identity_term(percept.presence, prior),
+                         "f_position": position_term(before, after)}
         if not present:
             return terms
         last, name = self.last_seen.get(percept.object), percept.object

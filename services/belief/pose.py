@@ -63,11 +63,11 @@ class GoalView:
         self.elevation, self.azimuth = (x.ravel() for x in np.meshgrid(elevation, azimuth, indexing="ij"))
         self.prior = np.zeros((GRID_ELEVATIONS, GRID_AZIMUTHS))  # even in elevation, as goals are drawn (section 4.1)
         self.keyframes: list[Keyframe] = []
-        self.center: Array | None = None
+        self.center = np.full(3, np.inf)  # where the object was believed last: nowhere yet
 
     def seen(self, percept: Percept, center: Array) -> None:
         """Adds a view of the object, believed at `center` [3], unless one like it is kept."""
-        if self.center is None or np.linalg.norm(center - self.center) > MOVED_M:
+        if np.linalg.norm(center - self.center) > MOVED_M:
             self.center = np.array(center)
             for keyframe in self.keyframes:
                 keyframe.log_likelihood = self._likelihood(keyframe.eye, keyframe.mean)
@@ -95,7 +95,7 @@ class GoalView:
         near = direction(self.azimuth, self.elevation) @ unit(eye - self.center) > np.cos(HERE_RAD)
         # near the pole the azimuth turns the image: only what is turned as seen from here counts
         azimuth, elevation, _ = spherical(eye, self.center)
-        turned = np.abs(wrap(self.azimuth - azimuth)) < HERE_RAD / max(np.cos(elevation), HERE_RAD)
+        turned = np.abs(wrap(self.azimuth - azimuth)) < HERE_RAD / max(float(np.cos(elevation)), HERE_RAD)
         upright = (elevation < np.pi / 2 - 3 * HERE_RAD) | (np.abs(wrap(self.azimuth - azimuth)) < TURNED_RAD)
         return float(share[near & turned & upright].sum())
 

@@ -90,7 +90,7 @@ class PositionFilter:
         share = max(born, FRESH_SHARE) if born else 0.0
         fresh = rng.permutation(len(self.particles))[:int(share * len(self.particles))]
         drawn = evidence.mean + rng.standard_normal((len(fresh), 3)) @ factor.T
-        inside = ((drawn > WORKSPACE_M[:, 0]) & (drawn < WORKSPACE_M[:, 1])).all(1)
+        inside = np.all((drawn > WORKSPACE_M[:, 0]) & (drawn < WORKSPACE_M[:, 1]), axis=1)
         self.particles[fresh] = np.where(inside[:, None], drawn, self.particles[fresh])
         likelihood = (1 - born) * (_density(self.particles, evidence, factor) + OUTLIER / VOLUME_M3)
         self.weights[fresh] = 1.0  # drawn from the percept itself, their share of the posterior is known:
@@ -137,7 +137,7 @@ class PositionFilter:
         return self.particles[np.minimum(np.searchsorted(np.cumsum(self.weights), places), len(self.weights) - 1)]
 
 
-def _density(points: Array, evidence: Evidence, factor: Array) -> Array:
+def _density(points: Array, evidence: Evidence, factor: NDArray[np.floating]) -> Array:
     """Gaussian density [N], per cubic metre."""
     whitened = np.linalg.solve(factor, (points - evidence.mean).T)
     return np.exp(-0.5 * (whitened ** 2).sum(0)) / ((2 * np.pi) ** 1.5 * np.prod(np.diag(factor)))

@@ -42,7 +42,7 @@ class Camera:
 
     def begin(self, run: str, episode: int) -> list[Output]:
         """The goal and the first frame. Raises SaccadeError where no image has a pose."""
-        self._at, self._published, self.skipped = {"run": run, "episode": episode}, 0, 0
+        self._run, self._episode, self._published, self.skipped = run, episode, 0, 0
         self._first: SourceImage | None = None
         self._images = self._all_images()
         frame = self.next_frame()
@@ -50,7 +50,7 @@ class Camera:
             seen = f"{self.skipped} images of {self.source.name} ({self._first} to {self._last})"
             raise SaccadeError(f"none of the {seen} has a pose in {self.poses}: give poses by the images' names, "
                                "indices or times")
-        goal = Goal(**self._at, step=0, rgb=self.goal_rgb, intrinsics_px=np.array(INTRINSICS_PX))
+        goal = Goal(run=run, episode=episode, step=0, rgb=self.goal_rgb, intrinsics_px=np.array(INTRINSICS_PX))
         return [Output(GOAL, goal), *frame]
 
     def next_frame(self) -> list[Output]:
@@ -60,8 +60,9 @@ class Camera:
             self._first, self._last = self._first or image, image
             world_from_camera = self.poses.of(image)
             if world_from_camera is not None:
-                frame = Frame(**self._at, step=self._published, rgb=self.virtual_camera.see(image.rgb),
-                              intrinsics_px=np.array(INTRINSICS_PX), world_from_camera=world_from_camera)
+                frame = Frame(run=self._run, episode=self._episode, step=self._published,
+                              rgb=self.virtual_camera.see(image.rgb), intrinsics_px=np.array(INTRINSICS_PX),
+                              world_from_camera=world_from_camera)
                 self._published += 1
                 return [Output(FRAME, frame)]
             self.skipped += 1

@@ -87,5 +87,5 @@ class VirtualCamera:
         seen = Image.fromarray(rgb).resize((u.last - u.first, v.last - v.first), Image.Resampling.BILINEAR,
                                            box=(u.start, v.start, u.end, v.end))
         result = np.full((IMAGE_SIZE_PX, IMAGE_SIZE_PX, 3), FILL, dtype=np.uint8)
-        result[v.first:v.last, u.first:u.last] = seen
+        result[v.first:v.last, u.first:u.last] = np.asarray(seen)
         return result

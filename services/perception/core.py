@@ -88,24 +88,25 @@ class Perception:
 
     def step(self, inputs: Inputs) -> Iterable[Output]:
         """The goal's percepts at the first step of an episode, then the frame's."""
-        if self.model is None:
+        model = self.model
+        if model is None:
             return
         frame: Frame = inputs["frame"]
         if not self.goal_told:
             self.goal_told = True
-            yield from self._goal(inputs["goal"])
+            yield from self._goal(model, inputs["goal"])
         up = frame.world_from_camera[2, :3]
-        seen = self.model.see(frame.rgb, frame.intrinsics_px, up)
+        seen = model.see(frame.rgb, frame.intrinsics_px, up)
         for k, name in enumerate(self.names):
             yield Output(PERCEPT, percept(frame, name, seen, k, frame.world_from_camera), name)
 
-    def _goal(self, goal: Goal) -> Iterable[Output]:
+    def _goal(self, model: SceneCCN | PaperSceneCCN, goal: Goal) -> Iterable[Output]:
         if goal.rgb is None:
             blank = np.zeros((480, 480, 3), dtype=np.uint8)
-            seen = self.model.see(blank, goal.intrinsics_px, (0.0, 1.0, 0.0))
+            seen = model.see(blank, goal.intrinsics_px, (0.0, 1.0, 0.0))
             seen.presence[:] = 0.0
         else:
-            seen = self.model.see(goal.rgb, goal.intrinsics_px, (0.0, 1.0, 0.0))
+            seen = model.see(goal.rgb, goal.intrinsics_px, (0.0, 1.0, 0.0))
         for k, name in enumerate(self.names):
             yield Output(GOAL_PERCEPT, percept(goal, name, seen, k, np.eye(4)), name)
 

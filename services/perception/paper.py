@@ -67,8 +67,10 @@ class SpatialTransformer(nn.Module):
         self.layers = nn.Sequential(
             nn.Flatten(), nn.Linear(3 * WHERE_PX ** 2, 256), nn.LeakyReLU(), nn.Linear(256, 128), nn.LeakyReLU(),
             nn.Linear(128, 64), nn.LeakyReLU(), nn.Linear(64, 3), nn.ELU())
+        last = self.layers[-2]
+        assert isinstance(last, nn.Linear)
         with torch.no_grad():
-            self.layers[-2].bias.copy_(torch.tensor([0.0, 0.0, START]))
+            last.bias.copy_(torch.tensor([0.0, 0.0, START]))
 
     def forward(self, masked: Tensor) -> tuple[Tensor, Tensor]:
         small = F.interpolate(masked, size=(WHERE_PX, WHERE_PX), mode="area")

@@ -11,9 +11,10 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from saccade.services.planner.free_energy import Terms, expected_free_energy
-from saccade.services.planner.goal import aim, infer_preference
+from saccade.services.planner.goal import Preference, aim, infer_preference
 from saccade.services.planner.motion import step_towards
 from saccade.shared.bus.messages import Action, Belief, Plan
 from saccade.shared.bus.topics import ACTION, BELIEF, GOAL_PERCEPT, PLAN, Output
@@ -65,9 +66,9 @@ class Planner:
 
     def begin(self, run: str, episode: int) -> Iterable[Output]:
         """A new goal."""
-        self.episode, self.preference, self.goal_known = episode, None, False
-        self.viewpoint: Array | None = None
-        self.plan: Plan | None = None
+        self.episode, self.goal_known = episode, False
+        self.preference: Preference | None = None
+        self.plan: Plan | None = None  # as it was chosen
         self.age = 0
         self.before: Array | None = None  # where the camera was
         self.visited: list[Array] = []  # views [4, 4] in which the target was seen not to be as in the goal
@@ -87,21 +88,22 @@ class Planner:
             self.preference = preference if known and not self.config.scene.explore else None
         self._refine(beliefs)
         spheres = self._obstacles(beliefs)
-        arrived = self._arrived(camera)
-        there = arrived and self.plan is not None and self.plan.mode == "goal"
-        declared = there and beliefs[self.plan.target].goal_here > SURE
-        if there and self.config.planner.retry:
-            self.visited.append(camera)
+        chosen, declared = self.plan, False
+        arrived = chosen is not None and self._arrived(camera, chosen.viewpoint)
+        if chosen is not None and arrived and chosen.mode == "goal":
+            declared = beliefs[chosen.target].goal_here > SURE
+            if self.config.planner.retry:
+                self.visited.append(camera)
         self.age += 1
         mode = self._mode(beliefs)
-        if self.plan is None or arrived or mode != self.plan.mode or self.age >= self.config.planner.replan_every:
-            self._choose(stamp, mode, beliefs, camera, spheres)
+        if chosen is None or arrived or mode != chosen.mode or self.age >= self.config.planner.replan_every:
+            chosen = self.plan = self._choose(stamp, mode, beliefs, camera, spheres)
         self.before = camera
-        heading = self._heading(camera, beliefs)
+        heading = self._heading(camera, chosen, beliefs)
         translation, rotation = step_towards(camera, heading, spheres, self.config.planner.step_m)
         if declared:  # it is judged where it says so
             translation, rotation = np.zeros(3), np.zeros(3)
-        plan = self._publish(stamp, camera, beliefs, declared)
+        plan = self._published(chosen, stamp, camera, beliefs, declared)
         yield Output(PLAN, plan)
         yield Output(ACTION, Action(run=plan.run, episode=plan.episode, step=plan.step, translation_m=translation,
                                     rotation_rad=rotation, arrived=declared))
@@ -111,22 +113,20 @@ class Planner:
         if self.preference and beliefs[self.preference.target].goal_range_m > 0:
             self.preference = replace(self.preference, range_m=beliefs[self.preference.target].goal_range_m)
 
-    def _arrived(self, camera: Array) -> bool:
-        if self.viewpoint is None:
-            return False
+    def _arrived(self, camera: Array, viewpoint: Array) -> bool:
         if self.moved_by_others:  # it may stand still anywhere, and no hand is exact
-            return success(camera, self.viewpoint)
+            return success(camera, viewpoint)
         moved = _between(camera, self.before) if self.before is not None and self.age > 1 else (1.0, 1.0)
-        near = _between(camera, self.viewpoint)
+        near = _between(camera, viewpoint)
         return (near[0] < ARRIVED_M and near[1] < ARRIVED_RAD) or (moved[0] < STUCK_M and moved[1] < ARRIVED_RAD)
 
-    def _heading(self, camera: Array, beliefs: dict[str, Belief]) -> Array:
+    def _heading(self, camera: Array, plan: Plan, beliefs: dict[str, Belief]) -> Array:
         """Where to go and how to look meanwhile [4, 4]: at the point of interest on the way, as planned on arrival."""
-        if np.linalg.norm(self.viewpoint[:3, 3] - camera[:3, 3]) < TURN_M:
-            return self.viewpoint
-        gaze = self.plan.look_at_m if self.plan.mode == "search" else beliefs[self.plan.target].mean_m
+        if np.linalg.norm(plan.viewpoint[:3, 3] - camera[:3, 3]) < TURN_M:
+            return plan.viewpoint
+        gaze = plan.look_at_m if plan.mode == "search" else beliefs[plan.target].mean_m
         heading = look_at(camera[:3, 3], gaze)
-        heading[:3, 3] = self.viewpoint[:3, 3]
+        heading[:3, 3] = plan.viewpoint[:3, 3]
         return heading
 
     def _obstacles(self, beliefs: dict[str, Belief]) -> Spheres:
@@ -142,33 +142,33 @@ class Planner:
             return "search"
         return "approach" if target.goal_log_posterior is None else "goal"
 
-    def _choose(self, stamp: Belief, mode: str, beliefs: dict[str, Belief], camera: Array, spheres: Spheres) -> None:
+    def _choose(self, stamp: Belief, mode: str, beliefs: dict[str, Belief], camera: Array, spheres: Spheres) -> Plan:
         """Draws candidates, weighs them, takes the best."""
         rng = generator(self.config.seed, self.config.bus.world, self.episode, stamp.step, "planner")
-        target = beliefs[self.preference.target] if self.preference else None
-        found, known = mode != "search", mode == "goal"
-        eyes, gazes = self._candidates(target, beliefs, rng)
-        if known:
-            best = self._goal_viewpoint(target, self._peak(target))
+        found, best = self.preference if mode != "search" else None, None
+        eyes, gazes = self._candidates(beliefs, rng)
+        if found is not None and (log_posterior := beliefs[found.target].goal_log_posterior) is not None:
+            target = beliefs[found.target]
+            best = self._goal_viewpoint(found, target, _peak(target.mean_m, log_posterior, found.range_m))
             eyes, gazes = np.vstack([eyes, best[:3, 3]]), np.vstack([gazes, target.mean_m])
         eyes = np.clip(eyes, LOWER_M, UPPER_M)
-        terms = expected_free_energy(eyes, gazes, beliefs, self.preference if found else None,
-                                     self.config.planner.information_weight)
-        if found:  # each time that the best was not it, the belief is trusted less, and other places are tried
+        terms = expected_free_energy(eyes, gazes, beliefs, found, self.config.planner.information_weight)
+        if found is not None:  # each time that the best was not it, the belief is trusted less, other places are tried
             cost = (terms.pose + terms.scale) / self._doubt + terms.position + terms.information
-            cost = cost + self._visited_cost(eyes, target.mean_m)
+            cost = cost + self._visited_cost(eyes, beliefs[found.target].mean_m)
         else:  # among views that tell the same, the nearest
             cost = terms.total + NEARER * np.linalg.norm(eyes - camera[:3, 3], axis=1)
         chosen = int(np.argmin(cost))
-        if known:
-            self.viewpoint = best if chosen == len(eyes) - 1 else self._goal_viewpoint(target, eyes[chosen])
+        if found is None or best is None:
+            viewpoint = look_at(clip(eyes[chosen], spheres), gazes[chosen])
+        elif chosen == len(eyes) - 1:
+            viewpoint = best
         else:
-            self.viewpoint = look_at(clip(eyes[chosen], spheres), gazes[chosen])
+            viewpoint = self._goal_viewpoint(found, beliefs[found.target], eyes[chosen])
         self.age = 0
         leading = np.argsort(cost)[:PUBLISHED]
-        self.plan = replace(self._plan(stamp, mode, gazes[chosen], terms, chosen),
-                            best_eyes_m=eyes[leading].astype(np.float32),
-                            best_g=terms.total[leading].astype(np.float32))
+        return replace(self._plan(stamp, mode, viewpoint, gazes[chosen], terms, chosen),
+                       best_eyes_m=eyes[leading].astype(np.float32), best_g=terms.total[leading].astype(np.float32))
 
     @property
     def _doubt(self) -> float:
@@ -176,19 +176,18 @@ class Planner:
         or the agent would forget what it knows."""
         return min(1.0 + len(self.visited), DOUBT_LIMIT)
 
-    def _candidates(self, target: Belief | None, beliefs: dict[str, Belief],
-                    rng: np.random.Generator) -> tuple[Array, Array]:
+    def _candidates(self, beliefs: dict[str, Belief], rng: np.random.Generator) -> tuple[Array, Array]:
         """Eyes and look-at points [N, 3]: a third from the goal posterior, a third at the goal's range, a third
         anywhere; the look-at points from the particles."""
-        count = self.config.planner.candidates
-        watched = [target] if target is not None else list(beliefs.values())
+        count, preference = self.config.planner.candidates, self.preference
+        watched = [beliefs[preference.target]] if preference is not None else list(beliefs.values())
         clouds = np.concatenate([belief.particles_m for belief in watched]).astype(np.float64)
         gazes = clouds[rng.integers(len(clouds), size=count)]
         eyes = rng.uniform(LOWER_M, UPPER_M, (count, 3))
-        if self.preference is None:
+        if preference is None:
             return eyes, gazes
-        third, doubt = count // 3, self._doubt
-        reach = self.preference.range_m + rng.normal(0, SPREAD_M, third)
+        third, doubt, target = count // 3, self._doubt, beliefs[preference.target]
+        reach = preference.range_m + rng.normal(0, SPREAD_M, third)
         away = unit(eyes[third:2 * third] - gazes[third:2 * third])
         eyes[third:2 * third] = gazes[third:2 * third] + np.maximum(reach, 0.1)[:, None] * away
         if target.goal_log_posterior is not None:
@@ -197,7 +196,7 @@ class Planner:
             elevation, azimuth = viewing_grid()
             e, a = elevation[cells // len(azimuth)], azimuth[cells % len(azimuth)]
             away = direction(a + rng.uniform(-CELL_RAD, CELL_RAD, third), e + rng.uniform(-CELL_RAD, CELL_RAD, third))
-            reach = self.preference.range_m * np.exp(rng.normal(0, SPREAD * doubt, third))
+            reach = preference.range_m * np.exp(rng.normal(0, SPREAD * doubt, third))
             gazes[:third] = target.mean_m
             eyes[:third] = gazes[:third] + reach[:, None] * away
         return eyes, gazes
@@ -205,50 +204,53 @@ class Planner:
     def _visited_cost(self, eyes: Array, center: Array) -> Array:
         """A price on views of `center` [3] like those in which the target was seen not to be as in the goal [N]."""
         cost = np.zeros(len(eyes))
-        rotations = rotation_towards(center - eyes) if self.visited else None
+        if not self.visited:
+            return cost
+        rotations = rotation_towards(center - eyes)
         for seen in self.visited:
             far = ((eyes - seen[:3, 3]) ** 2).sum(1) / VISITED_M ** 2
             turned = (rotation_angle(rotations, seen[:3, :3]) / VISITED_RAD) ** 2
             cost += VISITED_COST * np.exp(-0.5 * (far + turned))
         return cost
 
-    def _peak(self, target: Belief) -> Array:
-        """The eye [3] at the posterior's peak, averaged over its neighbours, at the goal's range. Azimuth and elevation
-        are averaged apart: near the pole neighbours in space may be views turned half round."""
-        elevation, azimuth = viewing_grid()
-        log_posterior = target.goal_log_posterior.astype(np.float64)
-        row, column = np.unravel_index(np.argmax(log_posterior), log_posterior.shape)
-        rows = np.arange(max(row - PEAK_ROWS, 0), min(row + PEAK_ROWS + 1, len(elevation)))
-        columns = np.arange(column - PEAK_COLUMNS, column + PEAK_COLUMNS + 1) % len(azimuth)
-        mass = np.exp(log_posterior[np.ix_(rows, columns)] - log_posterior[row, column])
-        mass /= mass.sum()
-        mean_azimuth = azimuth[column] + (mass * wrap(azimuth[columns] - azimuth[column])).sum()
-        mean_elevation = (mass * elevation[rows][:, None]).sum()
-        return target.mean_m + self.preference.range_m * direction(mean_azimuth, mean_elevation)
-
-    def _goal_viewpoint(self, target: Belief, eye: Array) -> Array:
+    def _goal_viewpoint(self, preference: Preference, target: Belief, eye: Array) -> Array:
         """The view from `eye` [3] that shows the target at the goal's pixel [4, 4]. As in the environment, the position
         is clipped (when the camera moves there) and the attitude is kept."""
         if not self.config.planner.goal_pixel:
             return look_at(eye, target.mean_m)
-        return aim(eye, target.mean_m, self.preference.pixel, self.preference.intrinsics_px)
+        return aim(eye, target.mean_m, preference.pixel, preference.intrinsics_px)
 
-    def _plan(self, stamp: Belief, mode: str, gaze: Array, terms: Terms, chosen: int) -> Plan:
+    def _plan(self, stamp: Belief, mode: str, viewpoint: Array, gaze: Array, terms: Terms, chosen: int) -> Plan:
         return Plan(
-            run=stamp.run, episode=stamp.episode, step=stamp.step, mode=mode, viewpoint=self.viewpoint, look_at_m=gaze,
+            run=stamp.run, episode=stamp.episode, step=stamp.step, mode=mode, viewpoint=viewpoint, look_at_m=gaze,
             target=self.preference.target if self.preference else "", g_position=float(terms.position[chosen]),
             g_scale=float(terms.scale[chosen]), g_pose=float(terms.pose[chosen]),
             g_information=float(terms.information[chosen]), candidates=len(terms.position), believed_distance_m=-1.0,
             goal_confidence=self.confidence,
             arrived=False)
 
-    def _publish(self, stamp: Belief, camera: Array, beliefs: dict[str, Belief], declared: bool) -> Plan:
+    def _published(self, plan: Plan, stamp: Belief, camera: Array, beliefs: dict[str, Belief], declared: bool) -> Plan:
         """The plan as it stands at this step."""
-        distance, target = -1.0, beliefs.get(self.plan.target)
-        if target is not None and target.goal_log_posterior is not None:
-            distance = float(np.linalg.norm(self._peak(target) - camera[:3, 3]))
-        return replace(self.plan, step=stamp.step, viewpoint=self.viewpoint, believed_distance_m=distance,
-                       arrived=declared)
+        distance, target = -1.0, beliefs.get(plan.target)
+        if self.preference is not None and target is not None and target.goal_log_posterior is not None:
+            eye = _peak(target.mean_m, target.goal_log_posterior, self.preference.range_m)
+            distance = float(np.linalg.norm(eye - camera[:3, 3]))
+        return replace(plan, step=stamp.step, believed_distance_m=distance, arrived=declared)
+
+
+def _peak(center: Array, log_posterior: NDArray[np.float32], range_m: float) -> Array:
+    """The eye [3] at the posterior's peak, averaged over its neighbours, at the goal's range. Azimuth and elevation
+    are averaged apart: near the pole neighbours in space may be views turned half round."""
+    elevation, azimuth = viewing_grid()
+    fine = log_posterior.astype(np.float64)
+    row, column = map(int, np.unravel_index(np.argmax(fine), fine.shape))
+    rows = np.arange(max(row - PEAK_ROWS, 0), min(row + PEAK_ROWS + 1, len(elevation)))
+    columns = np.arange(column - PEAK_COLUMNS, column + PEAK_COLUMNS + 1) % len(azimuth)
+    mass = np.exp(fine[np.ix_(rows, columns)] - fine[row, column])
+    mass /= mass.sum()
+    mean_azimuth = azimuth[column] + (mass * wrap(azimuth[columns] - azimuth[column])).sum()
+    mean_elevation = (mass * elevation[rows][:, None]).sum()
+    return center + range_m * direction(mean_azimuth, mean_elevation)
 
 
 def _between(a: Array, b: Array) -> tuple[float, float]:

@@ -52,7 +52,7 @@ def expected_free_energy(eyes: Array, look_at: Array, beliefs: dict[str, Belief]
                          information_weight: float) -> Terms:
     """G of candidates at `eyes` [N, 3] that look at `look_at` [N, 3]. Without a preference only information counts."""
     zero = np.zeros(len(eyes))
-    gain = sum(information_gain(eyes, look_at, belief) for belief in beliefs.values())
+    gain = sum((information_gain(eyes, look_at, belief) for belief in beliefs.values()), start=zero)
     information = -information_weight * gain
     if preference is None:
         return Terms(zero, zero, zero, information)

@@ -111,7 +111,7 @@ def _outside(position: ArrayLike, spheres: Spheres) -> Array:
     if spheres.depth_m(clipped) <= _SLACK_M:
         return clipped
     around = _allowed((clipped + _SHELLS_M[:, None, None] * _CORNERS).reshape(-1, 3), spheres)
-    nearest = np.linalg.norm(around - position, axis=1)
+    nearest = np.linalg.norm(around - np.asarray(position), axis=1)
     return around[np.argmin(nearest)] if len(around) else clipped
 
 
@@ -139,7 +139,7 @@ def _free(starts: Array, ends: Array, spheres: Spheres) -> np.ndarray:
 def _along(way: Array, distance_m: float) -> Array:
     """The point [3] this far along a way [K, 3], or its end."""
     for here, there in pairwise(way):
-        length = np.linalg.norm(there - here)
+        length = float(np.linalg.norm(there - here))
         if length > distance_m:
             return here + (there - here) * (distance_m / length)
         distance_m -= length

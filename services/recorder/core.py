@@ -8,7 +8,7 @@ import itertools
 import platform
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from importlib import metadata
 from pathlib import Path
@@ -70,9 +70,9 @@ class Recorder:
         """Until the inbox is stopped. A log that can take no more does not stop the agent: it is said on the bus at
         once, and raised as RecordingStopped at the end."""
         health, stopped = self.health, None
-        works = itertools.chain([self._ask_for_news, lambda: health.say("ready")],
-                                (partial(self._work_off, item) for item in inbox.items(tick_s=FLUSH_S)),
-                                [self.log.close])
+        works: Iterable[Callable[[], object]] = itertools.chain(
+            [self._ask_for_news, lambda: health.say("ready")],
+            (partial(self._work_off, item) for item in inbox.items(tick_s=FLUSH_S)), [self.log.close])
         with Heartbeat(self._bus, health, inbox.stop):
             for work in works:
                 try:
@@ -119,11 +119,12 @@ class Recorder:
         reader = None
         with contextlib.suppress(SaccadeError):  # killed before it wrote anything
             reader = RunReader(before)
-        for topic, part, payload, time_ns in reader.entries() if reader else ():
-            run = reader.metadata.get("run", {}).get("run")
-            if run != self._run:
-                raise SaccadeError(f"log {log.path} is there already, of the run {run}: move it away")
-            self._write(log, topic, part, payload, self._checked(topic, part, payload), time_ns)
+        if reader is not None:
+            for topic, part, payload, time_ns in reader.entries():
+                run = reader.metadata.get("run", {}).get("run")
+                if run != self._run:
+                    raise SaccadeError(f"log {log.path} is there already, of the run {run}: move it away")
+                self._write(log, topic, part, payload, self._checked(topic, part, payload), time_ns)
         log.flush()
 
     def _take(self, topic: Topic, part: str | None, payload: bytes) -> None:

@@ -15,18 +15,18 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from saccade.services.simulator.core import Simulator, names_in_use
-from saccade.services.simulator.objects import load_mesh
+from saccade.services.simulator.core import Simulator
+from saccade.services.simulator.objects import load_mesh, names_in_use
 from saccade.services.simulator.scenes import Scene, generate_scene, load_scenes
 from saccade.services.simulator.world import World
-from saccade.shared.bus.messages import Action
+from saccade.shared.bus.messages import Action, Frame
 from saccade.shared.config import SceneConfig
 from saccade.shared.errors import SaccadeError
 from saccade.shared.world.geometry import IMAGE_SIZE_PX
 from saccade.shared.world.task import ACTION_LIMIT, MAX_STEPS, errors
 
 ID = "saccade/ActiveSearch-v0"
-Observation = dict[str, np.ndarray]
+Observation = dict[str, Any]  # of arrays
 
 
 class ActiveSearch(gymnasium.Env[Observation, NDArray[np.float64]]):
@@ -59,10 +59,10 @@ class ActiveSearch(gymnasium.Env[Observation, NDArray[np.float64]]):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict]:
         """A new scene. Raises SaccadeError for an id that the file does not have."""
         super().reset(seed=seed)
-        self._simulator = Simulator(self._world, [self._draw((options or {}).get("scene"))], max_steps=self.max_steps)
-        outputs = {o.topic.name: o.message for o in self._simulator.begin("gym", 0)}
-        self._goal = outputs["goal"].rgb
-        return self._observe(outputs["frame"].rgb), self._info()
+        simulator = Simulator(self._world, [self._draw((options or {}).get("scene"))], max_steps=self.max_steps)
+        outputs: dict[str, Any] = {o.topic.name: o.message for o in simulator.begin("gym", 0)}
+        self._simulator, self._goal = simulator, outputs["goal"].rgb
+        return self._observe(outputs["frame"].rgb, simulator), _info(simulator)
 
     def _draw(self, scene_id: str | None) -> Scene:
         if scene_id is not None and scene_id not in self._file:
@@ -76,24 +76,21 @@ class ActiveSearch(gymnasium.Env[Observation, NDArray[np.float64]]):
 
     def step(self, action: NDArray[np.float64]) -> tuple[Observation, float, bool, bool, dict]:
         """One action [6]; see the class for the reward."""
-        if self._simulator is None:
+        simulator = self._simulator
+        if simulator is None:
             raise gymnasium.error.ResetNeeded("call reset before step")
         action = np.asarray(action, dtype=np.float64)
-        state = self._simulator.state
+        state = simulator.state
         move = Action(run="gym", episode=0, step=state.step, translation_m=action[:3], rotation_rad=action[3:])
-        frames = [o.message for o in self._simulator.step({"action": move}) if o.topic.name == "frame"]
+        messages = [output.message for output in simulator.step({"action": move})]
+        frames = [message for message in messages if isinstance(message, Frame)]
         image = frames[0].rgb if frames else self._world.render(state.camera)  # the last step has no frame of its own
-        return self._observe(image), float(state.success), state.success, state.done and not state.success, self._info()
+        return (self._observe(image, simulator), float(state.success), state.success, state.done and not state.success,
+                _info(simulator))
 
-    def _observe(self, image: NDArray[np.uint8]) -> Observation:
+    def _observe(self, image: NDArray[np.uint8], simulator: Simulator) -> Observation:
         self._image = image.copy()
-        return {"image": image, "goal": self._goal.copy(), "pose": self._simulator.state.camera.copy()}
-
-    def _info(self) -> dict[str, Any]:
-        state, scene = self._simulator.state, self._simulator.scene
-        azimuth, elevation, distance = errors(state.camera[:3, 3], state.goal[:3, 3], scene.target_placed.center_m)
-        return {"scene": scene.id, "azimuth_error_rad": azimuth, "elevation_error_rad": elevation,
-                "range_error_m": distance}
+        return {"image": image, "goal": self._goal.copy(), "pose": simulator.state.camera.copy()}
 
     def render(self) -> NDArray[np.uint8] | None:
         """What the camera sees [480, 480, 3], in render mode rgb_array."""
@@ -102,6 +99,13 @@ class ActiveSearch(gymnasium.Env[Observation, NDArray[np.float64]]):
     def close(self) -> None:
         """Frees the OpenGL context."""
         self._world.close()
+
+
+def _info(simulator: Simulator) -> dict[str, Any]:
+    state, scene = simulator.state, simulator.scene
+    azimuth, elevation, distance = errors(state.camera[:3, 3], state.goal[:3, 3], scene.target_placed.center_m)
+    return {"scene": scene.id, "azimuth_error_rad": azimuth, "elevation_error_rad": elevation,
+            "range_error_m": distance}
 
 
 gymnasium.register(ID, entry_point="saccade.services.simulator.gym_env:ActiveSearch")

@@ -7,6 +7,8 @@ The atlas holds the label that goes round (the whole width, at the top) and belo
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image, ImageDraw, ImageFont
@@ -26,6 +28,7 @@ PURPLE, PLUM, PINK, BROWN, TEAL = (112, 40, 150), (62, 18, 88), (238, 96, 156), 
 
 Colour = tuple[int, int, int]
 Rectangle = tuple[float, float, float, float, Colour]  # left, top, right, bottom
+Steps = Sequence[tuple[float, float]]  # up a profile: scale of the outline, height in metres
 
 
 class Art:
@@ -127,7 +130,7 @@ class Shape:
         """Blank label and lid."""
         return Art(ATLAS_PX, self.label_px, label), Art(*self.lid_px, lid)
 
-    def _skin(self, steps: ArrayLike) -> tuple[NDArray, NDArray]:
+    def _skin(self, steps: Steps) -> tuple[NDArray, NDArray]:
         """Vertices [V, 3] of the outline at (scale, height) steps [S, 2], and faces [F, 3] between them."""
         columns = len(self.outline)
         points = np.concatenate([np.c_[self.outline * scale, np.full(columns, z)] for scale, z in steps])
@@ -138,7 +141,7 @@ class Shape:
 
     def _side(self) -> tuple[NDArray, NDArray, NDArray]:
         """Vertices [V, 3], their pixels in the atlas [V, 2] and faces [F, 3] of the outside."""
-        points, faces = self._skin(self.profile)
+        points, faces = self._skin(self.profile.tolist())
         u, t = np.tile(self.u, len(self.t)), np.repeat(self.t, len(self.u))
         return points, np.c_[u * ATLAS_PX, (1 - t) * self.label_px], faces
 
@@ -153,7 +156,10 @@ class Shape:
 
     def mesh(self, name: str, label: Art, lid: Art) -> Mesh:
         """Closed mesh wearing the art; the base, never seen on a table, gets a plain two-coloured one."""
-        ground, base = label.image.getpixel((0, 0)), Art(*self.lid_px, SILVER)
+        pixel, base = label.image.getpixel((0, 0)), Art(*self.lid_px, SILVER)
+        assert isinstance(pixel, tuple)  # as in every colour image
+        red, green, blue = pixel
+        ground = red, green, blue
         base.rect((0, 0, 0.5, 1, ground))
         base.barcode(0.2, 0.2, 0.7, 0.45)
         atlas = Image.new("RGB", (ATLAS_PX, ATLAS_PX), ground)

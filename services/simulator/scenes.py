@@ -6,7 +6,7 @@ A file is JSON: `{"scenes": [...]}`, one map per scene with the keys of SCENE_KE
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -128,7 +128,7 @@ def _placed(entry: Any, names: Sequence[str] | None) -> Placed:
     return Placed(name, _numbers(entry, "center_xyz_m", (3,)), float(_numbers(entry, "yaw_rad", ())))
 
 
-def _check_keys(entry: Any, required: set[str], optional: set[str] = frozenset()) -> None:
+def _check_keys(entry: Any, required: Set[str], optional: Set[str] = frozenset()) -> None:
     if not isinstance(entry, dict):
         raise ValueError("not a map")
     if missing := sorted(required - entry.keys()):
@@ -189,7 +189,7 @@ def draw_goal(rng: np.random.Generator, centers_m: ArrayLike, sizes_m: ArrayLike
     """A goal view [4, 4] of object `index` of those with box centres [N, 3] and extents [N, 3] (paper, section 4.1)."""
     centers, extents = np.asarray(centers_m, dtype=np.float64), np.asarray(sizes_m, dtype=np.float64)
     azimuth, elevation = rng.uniform(0, 2 * np.pi), rng.uniform(0, np.pi / 2)
-    nearest = min(np.linalg.norm(extents[index]) / 2 + GOAL_CLEARANCE_M, GOAL_RANGE_MAX_M)
+    nearest = min(float(np.linalg.norm(extents[index])) / 2 + GOAL_CLEARANCE_M, GOAL_RANGE_MAX_M)
     position = centers[index] + rng.uniform(nearest, GOAL_RANGE_MAX_M) * direction(azimuth, elevation)
     goal = look_at(position, centers[index])
     goal[:3, 3] = clip(position, spheres_around(centers, extents))
@@ -215,7 +215,7 @@ def generate_split(sizes: Sizes, *, seed: int, targets: Sequence[str] | None = N
                    counts: Sequence[int] = (1, 2, 3, 4, 5), repeats: int = 20,
                    yaw: Literal["random", "fixed"] = "random") -> list[Scene]:
     """A split like the paper's: targets x counts x repeats. The same arguments draw the same scenes."""
-    scenes = []
+    scenes: list[Scene] = []
     for target in targets if targets is not None else tuple(sizes):
         for count in counts:
             for repeat in range(repeats):

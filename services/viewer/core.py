@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any, Generic, TypeVar
 
 import rerun as rr
 
@@ -27,20 +29,23 @@ from saccade.shared.world.geometry import IMAGE_SIZE_PX
 
 LIVE_PAUSE_S = 0.5  # between drawings of crops while a run goes on: browsers are sent no more than that either
 WAITING = 64  # images that wait for what is perceived in them
-WITHOUT = {  # what is not there to be seen without a topic
+WITHOUT: dict[Topic, str] = {  # what is not there to be seen without a topic
     FRAME: "the camera and what it sees", GOAL: "the goal", PERCEPT: "boxes, masks and crops",
     BELIEF: "particles, beliefs, entropy and F", PLAN: "candidates, viewpoints, G and decisions",
     TRUTH: "the true distance to the goal", STATUS: "milliseconds and messages dropped"}
 
 
+Shown = TypeVar("Shown", Percept, Belief)
+
+
 @dataclass
-class Gathered:
+class Gathered(Generic[Shown]):
     """Percepts or beliefs of one step, as far as they have come. In lockstep steps follow one another; where a camera
     does not wait, perception may be some steps behind it, beliefs behind perception."""
 
     step: int = -1
     frame: Frame | None = None
-    by_object: dict[str, Percept | Belief] = field(default_factory=dict)
+    by_object: dict[str, Shown] = field(default_factory=dict)
 
 
 class Viewer:
@@ -58,11 +63,13 @@ class Viewer:
         self._world = World(recording, self._colour_of, sizes_m)
         self._images = Images(recording, tuple(self._names), self._colour_of, imagination)
         self._curves = Curves(recording, tuple(self._names), self._colour_of)
-        self._show = {FRAME: self._frame, GOAL: self._images.goal, PERCEPT: self._percept, BELIEF: self._belief,
-                      PLAN: self._plan, TRUTH: self._true, RESULT: self._result, STATUS: self._status}
+        self._show: dict[Topic, Callable[[Any], None]] = {
+            FRAME: self._frame, GOAL: self._images.goal, PERCEPT: self._percept, BELIEF: self._belief,
+            PLAN: self._plan, TRUTH: self._true, RESULT: self._result, STATUS: self._status}
         self._episode, self._first, self._newest = -1, 0, 0  # which one, where it begins on the timeline, its last step
         self._frames: dict[int, Frame] = {}  # by step: in which nothing was perceived yet
-        self._seen, self._held = Gathered(), Gathered()  # percepts, beliefs of the newest step that has any
+        self._seen: Gathered[Percept] = Gathered()  # of the newest step that has any
+        self._held: Gathered[Belief] = Gathered()  # of the newest step that has any
         self._believed: dict[str, Belief] = {}
         self._said = ""
         self._came: set[str] = set()

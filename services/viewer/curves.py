@@ -23,7 +23,8 @@ class Curves:
 
     def __init__(self, recording: rr.RecordingStream, names: Sequence[str],
                  colour_of: Callable[[str], Colour]) -> None:
-        self._to, self._names, self._dropped = recording, tuple(names), {}
+        self._to, self._names = recording, tuple(names)
+        self._dropped: dict[str, int] = {}
         objects = {name: colour_of(name) for name in names}
         for path, series in {"F": F_TERMS, "G": G_TERMS, "entropy": objects, "presence": objects}.items():
             widths = [2.5 if name == "total" else 1.5 for name in series]

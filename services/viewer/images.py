@@ -66,8 +66,10 @@ class Images:
                                                         labels=[label], show_labels=True))
         mask = percept.mask()
         if mask is not None and mask.any():
-            self._to.log(f"{path}/mask", rr.LineStrips2D(outline(mask) * (width_px / len(mask)), colors=[colour],
-                                                         radii=0.8, draw_order=20))
+            lines = outline(mask) * (width_px / len(mask))
+            self._to.log(f"{path}/mask", rr.LineStrips2D(
+                lines,  # type: ignore[arg-type]  # Rerun takes an array [N, 2, 2] for N lines, and does not say so
+                colors=[colour], radii=0.8, draw_order=20))
 
     def step(self, frame: Frame, percepts: dict[str, Percept]) -> None:
         """The crops of the objects that a step shows, above what their networks make of them."""
@@ -85,7 +87,8 @@ class Images:
 
     def plan(self, plan: Plan, beliefs: dict[str, Belief]) -> None:
         """The view from the chosen viewpoint as imagined, whenever another one is chosen."""
-        if self._imagination is None or np.array_equal(plan.viewpoint, self._viewpoint):
+        if self._imagination is None or (
+                self._viewpoint is not None and np.array_equal(plan.viewpoint, self._viewpoint)):
             return
         self._viewpoint = plan.viewpoint
         known = [belief for belief in beliefs.values() if belief.presence >= SEEN]

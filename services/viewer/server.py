@@ -113,7 +113,8 @@ def with_free_ports(config: Config) -> Config:
 def binary() -> str:
     """Rerun's program. Raises SaccadeError where it is not installed."""
     spec = find_spec("rerun_cli")
-    path = Path(spec.origin).parent / ("rerun.exe" if sys.platform == "win32" else "rerun") if spec else None
+    folder = Path(spec.origin).parent if spec and spec.origin else None
+    path = folder / ("rerun.exe" if sys.platform == "win32" else "rerun") if folder else None
     if path is None or not path.is_file():
         raise SaccadeError("viewer: Rerun is not installed: pip install 'saccade[viewer]'")
     return str(path)
@@ -155,4 +156,9 @@ def _as_child() -> Callable[[], None] | None:
     if sys.platform != "linux":
         return None
     prctl = ctypes.CDLL(None).prctl
-    return lambda: (prctl(PR_SET_PDEATHSIG, signal.SIGKILL), session_comes_last())
+
+    def before_it_begins() -> None:
+        prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+        session_comes_last()
+
+    return before_it_begins

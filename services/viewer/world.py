@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -69,7 +70,9 @@ class World:
             return
         values, vectors = np.linalg.eigh(belief.covariance_m2)
         vectors[:, 0] *= np.sign(np.linalg.det(vectors))
-        look = {"colors": [colour], "labels": [plain(belief.object)], "show_labels": True} if appears else {}
+        look: dict[str, Any] = {}
+        if appears:
+            look = {"colors": [colour], "labels": [plain(belief.object)], "show_labels": True}
         self._to.log(f"{path}/belief", rr.Ellipsoids3D.from_fields(
             centers=[belief.mean_m], half_sizes=[CHI_95 * np.sqrt(np.maximum(values, 1e-8))],
             quaternions=[rr.Quaternion(xyzw=quaternion(vectors))], **look))
@@ -78,7 +81,7 @@ class World:
         """The best candidates, the best one green, and the chosen viewpoint, with the image that is imagined there."""
         imagined_px = np.array(INTRINSICS_PX) * (VIEW_PX / IMAGE_SIZE_PX)
         self._camera(VIEWPOINT, plan.viewpoint, imagined_px, (VIEW_PX,) * 2, PLANNED_M, PLANNED)
-        if plan.best_eyes_m is not None:
+        if plan.best_eyes_m is not None and plan.best_g is not None:
             above = plan.best_g - plan.best_g.min()
             shares = above / max(float(above.max()), 1e-6)
             self._to.log("world/candidates", rr.Points3D(

@@ -6,7 +6,7 @@ import dataclasses
 import functools
 import typing
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, TypeVar
 
 import numpy as np
 
@@ -19,13 +19,13 @@ class ArraySpec:
     shape: tuple[int | str, ...]
 
 
-def array(dtype: str, *shape: int | str) -> Any:
-    """Annotation of an array field."""
-    return Annotated[np.ndarray, ArraySpec(dtype, shape)]
+def array(dtype: str, *shape: int | str) -> ArraySpec:
+    """What an array field holds, for its annotation: `Annotated[np.ndarray, array("f4", "N", 3)]`."""
+    return ArraySpec(dtype, shape)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Message:
+class Message(metaclass=type):  # noqa: UP050 - without it mypy holds that its classes cannot be keys of a cache
     """What every message carries. `seq` counts the messages of one key and is set by the publisher."""
 
     VERSION: ClassVar[int] = 1
@@ -36,22 +36,25 @@ class Message:
     seq: int = 0
 
 
+AnyMessage = TypeVar("AnyMessage", bound=Message)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Frame(Message):
     """What the camera sees. Depth along the optical axis in metres, where the source has it."""
 
-    rgb: array("u1", "H", "W", 3)
-    intrinsics_px: array("f8", 4)  # fx, fy, cx, cy
-    world_from_camera: array("f8", 4, 4)
-    depth_m: array("f4", "H", "W") | None = None
+    rgb: Annotated[np.ndarray, array("u1", "H", "W", 3)]
+    intrinsics_px: Annotated[np.ndarray, array("f8", 4)]  # fx, fy, cx, cy
+    world_from_camera: Annotated[np.ndarray, array("f8", 4, 4)]
+    depth_m: Annotated[np.ndarray, array("f4", "H", "W")] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class Goal(Message):
     """The image to reach; without an image the agent explores."""
 
-    rgb: array("u1", "H", "W", 3) | None
-    intrinsics_px: array("f8", 4)
+    rgb: Annotated[np.ndarray, array("u1", "H", "W", 3)] | None
+    intrinsics_px: Annotated[np.ndarray, array("f8", 4)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,16 +71,16 @@ class Percept(Message):
 
     object: str
     presence: float
-    pixel: array("f8", 2)
+    pixel: Annotated[np.ndarray, array("f8", 2)]
     pixel_std: float
     scale: float
     log_scale_std: float
-    latent_mean: array("f4", "L")
-    latent_std: array("f4", "L")
-    intrinsics_px: array("f8", 4)
-    world_from_camera: array("f8", 4, 4)
+    latent_mean: Annotated[np.ndarray, array("f4", "L")]
+    latent_std: Annotated[np.ndarray, array("f4", "L")]
+    intrinsics_px: Annotated[np.ndarray, array("f8", 4)]
+    world_from_camera: Annotated[np.ndarray, array("f8", 4, 4)]
     reconstruction_error: float = 0.0
-    mask_bits: array("u1", "M", "B") | None = None
+    mask_bits: Annotated[np.ndarray, array("u1", "M", "B")] | None = None
 
     def mask(self) -> np.ndarray | None:
         """Where in the image the object is seen: truth values [M, M]."""
@@ -101,12 +104,12 @@ class Belief(Message):
 
     object: str
     presence: float
-    world_from_camera: array("f8", 4, 4)
-    mean_m: array("f8", 3)
-    covariance_m2: array("f8", 3, 3)
-    particles_m: array("f4", "N", 3)
+    world_from_camera: Annotated[np.ndarray, array("f8", 4, 4)]
+    mean_m: Annotated[np.ndarray, array("f8", 3)]
+    covariance_m2: Annotated[np.ndarray, array("f8", 3, 3)]
+    particles_m: Annotated[np.ndarray, array("f4", "N", 3)]
     views: int
-    goal_log_posterior: array("f4", "E", "A") | None = None
+    goal_log_posterior: Annotated[np.ndarray, array("f4", "E", "A")] | None = None
     goal_range_m: float = 0.0
     goal_here: float = 0.0
     f_pose: float = 0.0
@@ -132,8 +135,8 @@ class Plan(Message):
 
     target: str
     mode: str
-    viewpoint: array("f8", 4, 4)
-    look_at_m: array("f8", 3)
+    viewpoint: Annotated[np.ndarray, array("f8", 4, 4)]
+    look_at_m: Annotated[np.ndarray, array("f8", 3)]
     g_position: float  # -log P(t | v, goal): look at the goal object
     g_scale: float  # -log P(sigma | v, goal): at the desired scale
     g_pose: float  # -log P(p | v, goal): in the desired pose
@@ -142,8 +145,8 @@ class Plan(Message):
     goal_confidence: float  # that the goal image shows the target
     believed_distance_m: float  # from here to the goal's viewpoint as believed; infinite is not allowed: -1 if unknown
     arrived: bool
-    best_eyes_m: array("f4", "N", 3) | None = None
-    best_g: array("f4", "N") | None = None
+    best_eyes_m: Annotated[np.ndarray, array("f4", "N", 3)] | None = None
+    best_g: Annotated[np.ndarray, array("f4", "N")] | None = None
 
     @property
     def g(self) -> float:
@@ -158,8 +161,8 @@ class Action(Message):
     `arrived`: the agent says that with this move it is at the goal's view.
     """
 
-    translation_m: array("f8", 3)
-    rotation_rad: array("f8", 3)
+    translation_m: Annotated[np.ndarray, array("f8", 3)]
+    rotation_rad: Annotated[np.ndarray, array("f8", 3)]
     arrived: bool = False
 
 
@@ -174,12 +177,12 @@ class Truth(Message):
     scene: str
     target: str
     names: list[str]
-    centers_m: array("f8", "N", 3)
-    yaws_rad: array("f8", "N")
-    keep_out_m: array("f8", "N")
-    target_center_m: array("f8", 3)
-    world_from_camera: array("f8", 4, 4)
-    goal_world_from_camera: array("f8", 4, 4)
+    centers_m: Annotated[np.ndarray, array("f8", "N", 3)]
+    yaws_rad: Annotated[np.ndarray, array("f8", "N")]
+    keep_out_m: Annotated[np.ndarray, array("f8", "N")]
+    target_center_m: Annotated[np.ndarray, array("f8", 3)]
+    world_from_camera: Annotated[np.ndarray, array("f8", 4, 4)]
+    goal_world_from_camera: Annotated[np.ndarray, array("f8", 4, 4)]
     success: bool
     done: bool
     declared: bool = False  # the agent has said that it had arrived

@@ -58,10 +58,13 @@ class Outbox:
         names = {topic.name for topic in topics}
         with self._lock:
             chosen = [kept for kept in self._kept if kept.topic.name in names]
-        if since is None and chosen:
+        if since is None:
+            if not chosen:
+                return []
             since = (*chosen[-1].at[:2], 0)
         chosen = [kept for kept in chosen if kept.at[0] == since[0] and kept.at[1:] >= since[1:]]
-        answer, size = [], 0
+        answer: list[Kept] = []
+        size = 0
         for kept in chosen:
             if size > limit_bytes and kept.at != answer[-1].at:
                 break

@@ -34,7 +34,7 @@ def open_session(endpoint: str, *, listen: bool, onlooker: bool, timeout_s: floa
     except zenoh.ZError as error:
         raise SaccadeError(f"{CONFIG_VARIABLE}={file}: no configuration of Zenoh's: {str(error).split(' at /')[0]}"
                            ) from error
-    settings = {
+    settings: dict[str, object] = {
         "mode": "router" if listen else "client",
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,

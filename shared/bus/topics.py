@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 from saccade.shared.bus import messages as m
 from saccade.shared.errors import SaccadeError
 
 ROOT = "saccade"
 
+Of = TypeVar("Of", bound=m.Message, covariant=True)
+
 
 @dataclass(frozen=True)
-class Topic:
+class Topic(Generic[Of]):
     """One kind of publication. `parts`: one key per object (or service) below the topic's. `latched`: one value an
     episode, kept for every later step. `in_step`: published once per step (and part), so that gaps can be told."""
 
     name: str
-    type: type[m.Message]
+    type: type[Of]
     parts: bool = False
     latched: bool = False
     in_step: bool = True

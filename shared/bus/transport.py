@@ -6,6 +6,7 @@ Every endpoint is named: nothing is scouted, and nothing listens beyond the addr
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import os
 import queue
@@ -13,12 +14,15 @@ import re
 import socket
 import threading
 from collections.abc import Callable, Iterable
-from typing import Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from saccade.shared.bus.outbox import PAGE_BYTES, Kept, Since
 from saccade.shared.bus.topics import ROOT, Topic, parse_key
 from saccade.shared.bus.wire import MessageError, stamp_of
 from saccade.shared.errors import SaccadeError
+
+if TYPE_CHECKING:
+    import zenoh
 
 Deliver = Callable[[Topic, str | None, bytes], None]  # runs on the bus's thread: must only put its arguments somewhere
 Answer = Callable[[Iterable[Topic], Since | None, int], list[Kept]]
@@ -127,8 +131,8 @@ class ZenohBus:
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._subscribers: list[zenoh.Subscriber] = []
         self._queryables: list[zenoh.Queryable] = []
-        self._tokens: list = []
-        self._questions: queue.SimpleQueue = queue.SimpleQueue()
+        self._tokens: list[zenoh.LivelinessToken] = []
+        self._questions: queue.SimpleQueue[tuple[Topic, zenoh.Query] | None] = queue.SimpleQueue()
         self._closed = False
         self.endpoint = endpoint
         if not listen and endpoint.endswith(":0"):
@@ -158,7 +162,8 @@ class ZenohBus:
         """One Zenoh subscriber per topic; for all topics one alone, so that their order of arrival is kept."""
         keys = [f"{ROOT}/{self._world}/**"] if topics is None else [t.key(self._world) for t in topics]
 
-        def receive(sample) -> None:  # copies at once, so that shared memory is free again however slow the reader
+        def receive(sample: zenoh.Sample) -> None:
+            # copies at once, so that shared memory is free again however slow the reader
             try:
                 _, topic, part = parse_key(str(sample.key_expr))
             except SaccadeError:
@@ -169,17 +174,24 @@ class ZenohBus:
 
     def answer(self, topics: Iterable[Topic], answer: Answer) -> None:
         """Answers on a thread of its own: Zenoh's must not wait."""
-        for topic in topics:
-            self._queryables.append(self._session.declare_queryable(
-                topic.key(self._world), lambda query, topic=topic: self._questions.put((topic, query))))
+        def ask(topic: Topic, query: zenoh.Query) -> None:
+            self._questions.put((topic, query))
+
+        self._queryables += [self._session.declare_queryable(topic.key(self._world), functools.partial(ask, topic))
+                             for topic in topics]
         threading.Thread(target=self._answer_all, args=(answer,), name="answers", daemon=True).start()
 
     def _answer_all(self, answer: Answer) -> None:
         while (asked := self._questions.get()) is not None:
             topic, query = asked
             with contextlib.suppress(self._zenoh.ZError, ValueError, TypeError, KeyError):  # who asks is gone, or mad
-                question = json.loads(query.payload.to_bytes()) if query.payload else {"since": None, "limit": 0}
-                since = question["since"] and (str(question["since"][0]), *map(int, question["since"][1:3]))
+                question: dict[str, Any] = {"since": None, "limit": 0}
+                if query.payload:
+                    question = json.loads(query.payload.to_bytes())
+                since = None
+                if question["since"]:
+                    run, episode, step = question["since"]
+                    since = str(run), int(episode), int(step)
                 for kept in answer((topic,), since, int(question["limit"])):
                     query.reply(topic.key(self._world, kept.part), kept.payload,
                                 attachment=str(kept.published_ns).encode())
@@ -200,15 +212,17 @@ class ZenohBus:
                     if sample is not None and sample.attachment is not None:
                         _, _, part = parse_key(str(sample.key_expr))
                         payload = sample.payload.to_bytes()
-                        yield Kept(topic, part, payload, stamp_of(payload)[:3], int(sample.attachment.to_bytes()))
+                        run, episode, step, _ = stamp_of(payload)
+                        yield Kept(topic, part, payload, (run, episode, step), int(sample.attachment.to_bytes()))
         except self._zenoh.ZError:
             return  # no router at present
 
     def join(self, group: str, member: str, met: Met) -> None:
         """By liveliness: a process that was killed is gone within milliseconds, one that was stopped within seconds."""
-        members, key = set(), f"{ROOT}/{self._world}/@members/{group}"
+        members: set[str] = set()
+        key = f"{ROOT}/{self._world}/@members/{group}"
 
-        def receive(sample) -> None:
+        def receive(sample: zenoh.Sample) -> None:
             name = str(sample.key_expr).rsplit("/", 1)[-1]
             (members.add if sample.kind == self._zenoh.SampleKind.PUT else members.discard)(name)
             met(frozenset(members))
@@ -224,7 +238,9 @@ class ZenohBus:
                 return
             self._closed = True
         self._questions.put(None)
-        for entity in (*self._subscribers, *self._tokens, *self._queryables, *self._publishers.values()):
+        entities: tuple[zenoh.Subscriber | zenoh.LivelinessToken | zenoh.Queryable | zenoh.Publisher, ...] = (
+            *self._subscribers, *self._tokens, *self._queryables, *self._publishers.values())
+        for entity in entities:
             entity.undeclare()
         with contextlib.suppress(self._zenoh.ZError):  # someone it was connected to is suspended: not waited for
             self._session.close()

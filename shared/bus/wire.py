@@ -16,7 +16,7 @@ from typing import Annotated, Any, NamedTuple
 import msgpack
 import numpy as np
 
-from saccade.shared.bus.messages import ArraySpec, Message, field_types
+from saccade.shared.bus.messages import AnyMessage, ArraySpec, Message, field_types
 
 ARRAY_EXTENSION = 1  # msgpack ext type: msgpack([dtype, shape]) followed by the array's bytes, row-major
 MAX_SIDE = 8192
@@ -85,7 +85,7 @@ def stamp_of(payload: bytes) -> Stamp:
     return stamp
 
 
-def decode(message_type: type[Message], payload: bytes) -> Message:
+def decode(message_type: type[AnyMessage], payload: bytes) -> AnyMessage:
     """The message in `payload`. Raises MessageError with the field that is wrong."""
     if len(payload) > MAX_BYTES:
         raise MessageError(f"{len(payload)} bytes, more than {MAX_BYTES}")

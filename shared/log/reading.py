@@ -67,14 +67,17 @@ class RunReader:
 
     def entries(self) -> Iterator[Recorded]:
         """Every entry, valid or not."""
-        self.cut, self.refused, channels, migrate = None, 0, {}, None
+        channels: dict[int, tuple[Topic, str | None]] = {}
+        migrate = None
+        self.cut, self.refused = None, 0
         with self.path.open("rb") as stream:
             try:
                 reader = StreamReader(stream, validate_crcs=self._sums, record_size_limit=MAX_RECORD_BYTES)
                 for record in reader.records:
                     if isinstance(record, Channel):
                         with contextlib.suppress(SaccadeError):  # a channel that someone else added
-                            self.world, *channels[record.id] = parse_key(record.topic)
+                            self.world, topic, part = parse_key(record.topic)
+                            channels[record.id] = topic, part
                     elif isinstance(record, McapMessage) and record.channel_id in channels:
                         migrate = migrate or Migration(self.format, self.path)
                         topic, part = channels[record.channel_id]

@@ -7,7 +7,7 @@ import json
 import os
 import time
 import typing
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -50,15 +50,16 @@ class RunLog:
             self._file = _WholeRecords(path)
         except OSError as error:
             raise SaccadeError(f"log {path} cannot be written: {error.strerror}") from error
-        self._writer: Writer | None = Writer(self._file)
-        self._guarded(self._start, configuration, metadata or {})
+        writer = Writer(self._file)  # type: ignore[arg-type]  # it asks for no more than write, tell and flush
+        self._writer: Writer | None = writer
+        self._guarded(self._start, writer, configuration, metadata or {})
 
     def write(self, topic: Topic, part: str | None, payload: bytes, *, sequence: int = 0,
               log_time_ns: int | None = None) -> None:
         """Appends wire bytes, at the time of their arrival (now unless given)."""
         if self._writer is not None:
             now_ns = time.time_ns() if log_time_ns is None else log_time_ns
-            self._guarded(self._add, topic, part, payload, sequence, now_ns)
+            self._guarded(self._add, self._writer, topic, part, payload, sequence, now_ns)
             self.flush_if_due()
 
     def flush_if_due(self) -> None:
@@ -70,7 +71,8 @@ class RunLog:
         """Brings to the disk what was written so far."""
         if self._writer is not None:
             self._flushed_s = time.monotonic()
-            self._guarded(lambda: (self._writer.flush(), self._file.sync()))
+            self._guarded(self._writer.flush)
+            self._guarded(self._file.sync)
             self._stop_if_gone()
 
     def close(self) -> None:
@@ -82,7 +84,7 @@ class RunLog:
             self._writer = None
         self._file.close()
 
-    def _guarded(self, action, *arguments) -> None:
+    def _guarded(self, action: Callable[..., object], *arguments: object) -> None:
         try:
             action(*arguments)
         except OSError as error:
@@ -101,22 +103,23 @@ class RunLog:
             raise RecordingStopped(f"recording stopped: the log's {what} is gone ({self.path}): what is recorded from "
                                    "now on is lost; leave the folder of a run where it is until the run has ended")
 
-    def _start(self, configuration: str, metadata: Mapping[str, Mapping[str, str]]) -> None:
-        self._writer.start()
+    def _start(self, writer: Writer, configuration: str, metadata: Mapping[str, Mapping[str, str]]) -> None:
+        writer.start()
         for name, values in {LOG: {"format": FORMAT}, **metadata}.items():
-            self._writer.add_metadata(name, {str(k): str(v) for k, v in values.items()})
+            writer.add_metadata(name, {str(k): str(v) for k, v in values.items()})
         now = time.time_ns()
-        self._writer.add_attachment(now, now, CONFIGURATION, "application/json", configuration.encode())
+        writer.add_attachment(now, now, CONFIGURATION, "application/json", configuration.encode())
 
-    def _add(self, topic: Topic, part: str | None, payload: bytes, sequence: int, log_time_ns: int) -> None:
+    def _add(self, writer: Writer, topic: Topic, part: str | None, payload: bytes, sequence: int,
+             log_time_ns: int) -> None:
         key = topic.key(self._world, part)
         if key not in self._channels:
             name = topic.type.__name__
             if name not in self._schemas:
                 text = json.dumps(json_schema(topic.type), sort_keys=True).encode()
-                self._schemas[name] = self._writer.register_schema(name, "jsonschema", text)
-            self._channels[key] = self._writer.register_channel(key, "msgpack", self._schemas[name])
-        self._writer.add_message(self._channels[key], log_time_ns, payload, log_time_ns, sequence % 2 ** 32)
+                self._schemas[name] = writer.register_schema(name, "jsonschema", text)
+            self._channels[key] = writer.register_channel(key, "msgpack", self._schemas[name])
+        writer.add_message(self._channels[key], log_time_ns, payload, log_time_ns, sequence % 2 ** 32)
         self.messages += 1
 
 

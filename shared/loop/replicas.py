@@ -39,7 +39,8 @@ def shares(parts: Iterable[str], members: Iterable[str]) -> dict[str, str]:
 def alone_on(bus: Bus, name: str) -> None:
     """Says on the bus that this is the world's service of that name, of which there can be one only. Raises
     SaccadeError where another one was there before."""
-    me, others = f"{time.time_ns():020d}-{uuid.uuid4().hex}", set()
+    me = f"{time.time_ns():020d}-{uuid.uuid4().hex}"
+    others: set[str] = set()
     bus.join(name, me, others.update)
     time.sleep(MEET_S)
     if min({me, *others}) != me:

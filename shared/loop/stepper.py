@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from saccade.shared.bus.messages import Message
+from saccade.shared.bus.messages import Message, Truth
 from saccade.shared.bus.sequences import Stamper
-from saccade.shared.bus.topics import TRUTH, Output, Topic
+from saccade.shared.bus.topics import Output, Topic
 from saccade.shared.bus.wire import MessageError
 from saccade.shared.errors import SaccadeError
 from saccade.shared.loop.service import Core, Service
@@ -59,8 +59,8 @@ class Stepper:
             raise MessageError("topic: not an input")
         if topic.parts and part not in self.parts:
             raise MessageError(f"part: {part!r} is not an object of this run")
-        if topic.parts and getattr(message, "object", part) != part:
-            raise MessageError(f"object: {message.object!r} under the key of {part!r}")
+        if topic.parts and (named := getattr(message, "object", part)) != part:
+            raise MessageError(f"object: {named!r} under the key of {part!r}")
         if self._late(message, topic):
             return
         message = settle(message)
@@ -215,7 +215,7 @@ class Stepper:
             if self._source:
                 self._last_step = max(self._last_step, output.message.step)
                 self.at = (output.message.run, output.message.episode, self._last_step)
-                self.episode_done |= output.topic == TRUTH and output.message.done
+                self.episode_done |= isinstance(output.message, Truth) and output.message.done
         return stamped
 
 
@@ -230,7 +230,7 @@ def settle(message: Message) -> Message:
     Bytes from the wire are seldom aligned, and NumPy may sum unaligned numbers in another order: without this the same
     message would give other bytes in another process. Frozen, no core can change what another one holds.
     """
-    changed = {}
+    changed: dict[str, Any] = {}
     for field in dataclasses.fields(message):
         value = getattr(message, field.name)
         if isinstance(value, np.ndarray) and not (

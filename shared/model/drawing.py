@@ -98,7 +98,8 @@ def shuffled(x: Array) -> Array:
 def enlarged(x: Array, side: int) -> Array:
     """Bilinear, pixels' corners kept apart: [C, H, H] -> [C, side, side]."""
     between = _between(x.shape[-1], side)
-    return between @ x @ between.T
+    rows: Array = between @ x
+    return rows @ between.T
 
 
 @functools.cache

@@ -8,7 +8,7 @@ from __future__ import annotations
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from saccade.shared.errors import SaccadeError
 from saccade.shared.model.weights import Weights
@@ -56,7 +56,7 @@ def log_density(x: Array, mean: Array, std: Array) -> Array:
     return (-0.5 * ((x - mean) / std) ** 2 - np.log(std) - 0.9189385332046727).sum(-1)
 
 
-def kl_divergence(q: Gaussian, p: tuple[ArrayLike, ArrayLike]) -> Array:
+def kl_divergence(q: Gaussian, p: tuple[Array | float, Array | float]) -> Array:
     """KL[q || p] of diagonal Gaussians, summed over the last axis."""
     ratio = q[1] / p[1]
     return (0.5 * (ratio ** 2 + ((q[0] - p[0]) / p[1]) ** 2 - 1.0) - np.log(ratio)).sum(-1)
