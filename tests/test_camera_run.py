@@ -18,7 +18,7 @@ from PIL import Image
 from rich.console import Console
 
 from saccade.app.log.check import missing
-from saccade.app.look.picture import read_story
+from saccade.app.look.picture import draw_run, read_story
 from saccade.app.replay.replay import prepare, replay_here, replay_on_bus
 from saccade.app.run.display import Display, line, panel
 from saccade.app.run.run import in_world, run
@@ -56,7 +56,9 @@ def of(filmed, **values) -> Config:
 def played(config, out) -> str:
     """Runs it; what was printed."""
     console = Console(file=io.StringIO(), width=200)
-    assert run(config, agent="sceneccn", out=out, plain=True, console=console, world="camera") == []
+    finished = run(config, agent="sceneccn", out=out, plain=True, console=console, world="camera")
+    assert finished.results == []
+    draw_run(finished.folder)
     return console.file.getvalue()
 
 

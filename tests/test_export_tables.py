@@ -163,7 +163,7 @@ def test_what_cannot_be_exported_is_one_clear_error_and_leaves_nothing(run, tmp_
 
 
 @pytest.mark.parametrize(("kind", "package", "module"), [
-    ("mcap", "foxglove", "scene"), ("mcap", "google", "values"), ("tables", "pyarrow", "tables")])
+    ("mcap", "foxglove", "foxglove"), ("mcap", "google", "plottable"), ("tables", "pyarrow", "tables")])
 def test_a_missing_package_is_named_with_the_command_that_installs_it(run, tmp_path, monkeypatch, kind, package,
                                                                       module):
     for name in [n for n in sys.modules if n == package or n.startswith(f"{package}.")]:

@@ -9,7 +9,7 @@ import torch
 from rich.console import Console
 from torch import nn
 
-from saccade.app.cli import main as cli
+from saccade.app.cli.train import train as train_command
 from saccade.services.belief.core import BeliefFilter
 from saccade.services.perception.core import SceneCCN, build, model_of
 from saccade.services.perception.paper import (
@@ -268,6 +268,6 @@ def test_the_command_keeps_the_architectures_apart(monkeypatch, architecture, fo
         (run_dir.name, settings)))
     monkeypatch.setattr("saccade.training.run.export", lambda run_dir, target: called.append(
         (run_dir.name, target.name)))
-    cli.train(objects="pantry", names=",".join(NAMES), architecture=architecture)
+    train_command(objects="pantry", names=",".join(NAMES), architecture=architecture)
     (run_name, settings), exported = called
     assert (run_name, settings.architecture, exported) == (folder, architecture, (folder, folder))

@@ -18,29 +18,17 @@ from saccade.app.bench.bench import bench, prepare
 from saccade.app.bench.workers import in_processes
 from saccade.shared.config import Config
 from saccade.shared.errors import SaccadeError
+from saccade.tests.fakes.work import fails, square
 from saccade.tests.test_bench import timeless
 
 WORK = {f"scene {k}": (k,) for k in range(6)}
 INTERRUPTED = """
 import sys, time
 from saccade.app.bench.workers import in_processes
-from saccade.tests.test_workers import slow
+from saccade.tests.fakes.work import slow
 for scene, process in in_processes(slow, {str(k): (k,) for k in range(50)}, 2):
     print(process, flush=True)
 """
-
-
-def square(k: int) -> tuple[int, str]:
-    return k * k, os.environ["OMP_NUM_THREADS"]
-
-
-def slow(k: int) -> int:
-    time.sleep(0.3)
-    return os.getpid()
-
-
-def fails(k: int) -> int:
-    raise SaccadeError(f"no {k}")
 
 
 def dies(k: int) -> None:
