@@ -1,4 +1,7 @@
-"""Typed configuration: one object for a run, validated, saved beside its log. An unknown key is an error."""
+"""Typed configuration: one object for a run, validated, saved beside its log. An unknown key is an error.
+
+The text under each key is its description in the guide's reference.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ PRESETS, WEIGHTS = PACKAGE / "shared" / "presets", PACKAGE / "weights"
 
 
 class Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
 
 Checked = TypeVar("Checked", bound=Section)
@@ -25,29 +28,45 @@ Focal = Annotated[FiniteFloat, Field(gt=0)]
 
 
 class BusConfig(Section):
-    """Where services meet. Loopback unless told otherwise; no multicast."""
+    """Where the services of a run meet."""
 
     kind: Literal["zenoh", "local"] = "zenoh"
-    endpoint: str = "tcp/127.0.0.1:0"  # port 0: the launcher picks a free one
-    listen: str | None = None  # where the router listens, if others know it by another address
+    """`zenoh`: each service is a process on a Zenoh bus. `local`: all services run within one process."""
+    endpoint: str = "tcp/127.0.0.1:0"
+    """Address of the router. With port 0, the launcher picks a free port."""
+    listen: str | None = None
+    """Address on which the router listens, if the other services know it by another one."""
     world: str = Field("table", pattern=r"^[A-Za-z0-9_-]{1,64}$")
-    wait_for: tuple[str, ...] = ()  # services that must be ready before the source begins; the launcher fills it in
-    live: bool = False  # nobody waits: each service takes the newest step and says what it skipped
-    first_step: int = Field(0, ge=0)  # of an episode in lockstep: a log that was cut begins later
+    """Second part of every key. A world is one camera in one scene; several worlds can share a bus."""
+    wait_for: tuple[str, ...] = ()
+    """Services that must be ready before the source begins. The launcher fills this in."""
+    live: bool = False
+    """Nobody waits: each service takes the newest step and reports how many it skipped. Set for real cameras."""
+    first_step: int = Field(0, ge=0)
+    """First step of an episode. The replay of a log that was cut begins later than at 0."""
 
 
 class SceneConfig(Section):
-    """Which episodes: those of a scenes file, or drawn from a seed."""
+    """Which objects there are, and which episodes are run: those of a scenes file, or drawn from the seed."""
 
     objects: Literal["pantry", "ycb"] = "pantry"
-    names: tuple[str, ...] | None = None  # a subset of the set
+    """Object set."""
+    names: tuple[str, ...] | None = None
+    """Only these objects of the set."""
     file: Path | None = None
-    scene: str | None = None  # an id in the file; all of them where absent
+    """Scenes file (JSON)."""
+    scene: str | None = None
+    """Id of one scene in the file. Without it, all scenes of the file are run."""
     count: int = Field(1, ge=1)
+    """How many scenes are drawn."""
     n_objects: int | None = Field(None, ge=1, le=20)
+    """How many objects stand on the table. Without it, the number is drawn."""
     yaw: Literal["random", "fixed"] = "random"
+    """Whether drawn objects are turned about the vertical axis. In the paper they are not (`fixed`)."""
     goal_image: Path | None = None
+    """Image of the view to find, instead of the scene's own goal."""
     explore: bool = False
+    """No goal: the agent finds out what is on the table."""
 
     @property
     def goal_view_is_known(self) -> bool:
@@ -59,85 +78,130 @@ class SimulatorConfig(Section):
     """The paper's environment (section 4.1)."""
 
     max_steps: int = Field(350, ge=1)
-    until: Literal["reached", "declared"] = "reached"  # the paper's any-time success, or the agent's own word
-    publish_depth: bool = False  # no agent of ours needs it
+    """Steps after which an episode ends."""
+    until: Literal["reached", "declared"] = "reached"
+    """`reached`: an episode ends at the first step within the tolerance, as in the paper. `declared`: it ends when the
+    agent says that it has arrived."""
+    publish_depth: bool = False
+    """Whether frames carry depth. No agent that comes with Saccade needs it."""
 
 
 class CameraConfig(Section):
-    """Real images in the simulator's place; what is absent is assumed, and the camera says so."""
+    """A real camera instead of the simulator. For what you leave out, Saccade assumes a value and says so."""
 
-    source: str | None = None  # a folder of images, a video file, or a webcam: webcam:0
-    poses: Path | None = None  # JSON lines or TUM
-    pose_convention: Literal["opengl", "opencv"] | None = None  # JSON lines are OpenGL, TUM is OpenCV where absent
-    intrinsics_px: tuple[Focal, Focal, FiniteFloat, FiniteFloat] | None = None  # fx, fy, cx, cy of the source's images
-    rate_hz: float = Field(10.0, gt=0, le=1000)  # of a folder and of a webcam; a video has its own
+    source: str | None = None
+    """A folder of images, a video file, or a webcam (`webcam:0`)."""
+    poses: Path | None = None
+    """File with the camera's poses: JSON lines or TUM."""
+    pose_convention: Literal["opengl", "opencv"] | None = None
+    """Camera axes of the poses. Without it, JSON lines are taken as OpenGL and TUM as OpenCV."""
+    intrinsics_px: tuple[Focal, Focal, FiniteFloat, FiniteFloat] | None = None
+    """fx, fy, cx, cy of the source's images, in pixels."""
+    rate_hz: float = Field(10.0, gt=0, le=1000)
+    """Images per second from a folder or a webcam. A video has its own rate."""
     loop: bool = False
+    """Begin again with the first image after the last."""
 
 
 class PerceptionConfig(Section):
-    """`weights`: a folder with a manifest; the object set's own, of that architecture, where absent."""
+    """The networks that turn an image into percepts."""
 
     weights: Path | None = None
+    """Folder with trained weights. Without it, those that come with the object set."""
     architecture: Literal["default", "paper"] = "default"
-    passes: int = Field(2, ge=1, le=4)  # crops are corrected and cut again
+    """Which networks: Saccade's own, or those of the paper's tables."""
+    passes: int = Field(2, ge=1, le=4)
+    """How often each crop is corrected and cut again."""
 
 
 class BeliefConfig(Section):
-    """Particle filter per object (section 3.2) and the posterior over goal views."""
+    """Particle filter of each object (paper, section 3.2) and the posterior over the goal's viewpoint."""
 
     particles: int = Field(10_000, ge=100, le=1_000_000)
+    """Particles per object."""
     jitter_m: float = Field(0.002, gt=0)
+    """Standard deviation of the noise that is added to resampled particles."""
     present_above: float = Field(0.6, ge=0, le=1)
-    covariance: Literal["calibrated", "paper"] = "calibrated"  # of a percept: as the network is sure, or fixed
-    hidden: Literal["outlines", "nearest"] = "outlines"  # not looked for: behind an object's outline, or its range
-    pose: Literal["fused", "last"] = "fused"  # views that the goal's direction is inferred from
-    born: float = Field(0.02, ge=0, lt=1)  # prior that an object is where it is seen and not where it was believed
-    resample_below: float = Field(0.5, gt=0, le=1)  # effective share of particles
+    """An object counts as seen in an image if its presence is above this."""
+    covariance: Literal["calibrated", "paper"] = "calibrated"
+    """Uncertainty of a percept's position: as the network reports it, or fixed as in the paper."""
+    hidden: Literal["outlines", "nearest"] = "outlines"
+    """Where an object may be without being seen: behind the outline of a nearer object, or anywhere beyond the range of
+    the nearest one (the paper's way)."""
+    pose: Literal["fused", "last"] = "fused"
+    """Views from which the goal's direction is inferred: all of them, or the last one (the paper's way)."""
+    born: float = Field(0.02, ge=0, lt=1)
+    """Prior probability that an object is where it is seen now and not where it was believed to be."""
+    resample_below: float = Field(0.5, gt=0, le=1)
+    """Particles are resampled when their effective share falls below this."""
     missed_weight: float = Field(0.3, gt=0, le=1)
+    """Factor by which a particle loses weight when its object should have been seen and was not."""
     published_particles: int = Field(512, ge=16)
+    """How many particles a belief message carries."""
     keyframes: int = Field(24, ge=1)
-    view_worth: float = Field(0.5, gt=0, le=1)  # how much a view counts for the pose,
-    views_worth: float = Field(2.5, gt=0)  # and all views together
+    """How many views of an object are kept for its pose."""
+    view_worth: float = Field(0.5, gt=0, le=1)
+    """How much one view counts for the pose."""
+    views_worth: float = Field(2.5, gt=0)
+    """How much all views together count at most: they share the error of the goal's own percept."""
 
 
 class PlannerConfig(Section):
-    """Expected free energy over candidate viewpoints (equation 5)."""
+    """Expected free energy over candidate viewpoints (paper, equation 5)."""
 
     candidates: int = Field(5_000, ge=10, le=1_000_000)
+    """How many candidate viewpoints are drawn."""
     replan_every: int = Field(10, ge=1)
+    """A new viewpoint is chosen after this many steps, or on arrival."""
     step_m: float = Field(0.05, gt=0, le=0.5)
+    """How far the camera moves in one step."""
     range_std_m: float = Field(0.025, gt=0)
-    goal_confidence: float = Field(0.7, ge=0, le=1)  # below it the goal image says nothing
-    goal_pixel: bool = True  # the target is brought to where the goal image shows it, not to the centre
-    retry: bool = True  # a view that was not the goal's is left for another
+    """Standard deviation of the preferred range around the goal's range."""
+    goal_confidence: float = Field(0.7, ge=0, le=1)
+    """If no object is recognised in the goal image with at least this probability, the agent explores."""
+    goal_pixel: bool = True
+    """Bring the target to the pixel where the goal image shows it, instead of to the centre."""
+    retry: bool = True
+    """When a viewpoint turns out not to show the goal's view, leave it for another one."""
     information_weight: float = Field(1.0, ge=0)
+    """Weight of the expected information gain."""
 
 
 class ServicesConfig(Section):
-    """Modules from outside that stand in the place of our services: each declares a SERVICE and builds a core."""
+    """Modules of your own in the place of Saccade's services. Each declares a `SERVICE` and has `build(config)`."""
 
-    source: ModuleName | None = None  # of the simulator, or of the camera where that is the world
+    source: ModuleName | None = None
+    """In the place of the simulator, or of the camera with `--world camera`."""
     perception: ModuleName | None = None
+    """In the place of perception."""
     belief: ModuleName | None = None
+    """In the place of the belief."""
     planner: ModuleName | None = None
+    """In the place of the planner."""
 
 
 class ViewerConfig(Section):
-    """Where browsers find the viewer, and what it may keep. The page is on `port`, its data on `data_port` (0: a free
-    one); `truth`: also what the simulator alone knows."""
+    """The viewer in a browser."""
 
     address: str = "127.0.0.1"
+    """Address on which the viewer listens."""
     port: int = Field(9090, ge=1, le=65535)
+    """Port of the page."""
     data_port: int = Field(0, ge=0, le=65535)
+    """Port of the page's data. With 0, a free port is picked."""
     memory_mb: int = Field(1024, ge=16, le=1_000_000)
+    """Memory for the past of a run: a browser that comes late sees as much of it."""
     truth: bool = False
+    """Also show what only the simulator knows: the goal's camera, and the objects as ghosts."""
 
 
 class Config(Section):
-    """A run. `run` is its name; where absent, that of its folder."""
+    """A run."""
 
     run: str | None = None
+    """Name of the run. Without it, the name of its folder."""
     seed: int = Field(0, ge=0)
+    """Seed of everything random."""
     bus: BusConfig = BusConfig()
     scene: SceneConfig = SceneConfig()
     simulator: SimulatorConfig = SimulatorConfig()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import sys
+from typing import Annotated
 
 import typer
 
@@ -13,8 +14,26 @@ from saccade.shared.errors import SaccadeError
 
 EXIT_ERROR, EXIT_INTERRUPTED = 2, 130
 
-app = typer.Typer(name="saccade", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
-                  help="An active-vision agent: it looks, believes and moves until it sees the goal image.")
+app = typer.Typer(name="saccade", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
+
+
+def _tell_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        from saccade.shared.log.provenance import commit
+
+        print(f"saccade {version('saccade')} (commit {commit()})")
+        raise typer.Exit
+
+
+@app.callback()
+def front_door(version: Annotated[bool, typer.Option(
+        "--version", callback=_tell_version, is_eager=True, help="Print the version and the commit, and end.")] = False,
+        ) -> None:
+    """An active-vision agent: it looks, believes and moves until it sees the goal image."""
+
+
 for commands in (run, replay, bench, train, look):
     app.add_typer(commands.app)
 app.add_typer(log.app, name="log")
