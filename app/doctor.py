@@ -18,7 +18,7 @@ from rich.table import Table
 from saccade.services.simulator.objects import names_of, ycb_folder
 from saccade.services.simulator.opengl import choose_backend
 from saccade.shared.bus.messages import Status
-from saccade.shared.bus.topics import STATUS
+from saccade.shared.bus.topics import STATUS, Topic
 from saccade.shared.bus.transport import ZenohBus, free_endpoint
 from saccade.shared.bus.wire import encode
 from saccade.shared.config import Config, SceneConfig
@@ -126,11 +126,16 @@ def zenoh() -> Finding:
     endpoint = free_endpoint("tcp/127.0.0.1:0")
     sent = encode(Status(run="doctor", episode=0, step=0, service="doctor", state="ready"))
     arrived = threading.Event()
+
+    def hear(_topic: Topic, _part: str | None, payload: bytes) -> None:
+        if payload == sent:
+            arrived.set()
+
     router = ZenohBus(endpoint, world="doctor", listen=True)
     try:
         client = ZenohBus(endpoint, world="doctor")
         try:
-            router.subscribe((STATUS,), lambda _topic, _part, payload: payload == sent and arrived.set())
+            router.subscribe((STATUS,), hear)
             end = time.monotonic() + ANSWER_S
             while not arrived.is_set() and time.monotonic() < end:
                 client.publish(STATUS, "doctor", sent)

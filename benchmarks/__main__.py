@@ -11,6 +11,7 @@ import json
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -50,8 +51,8 @@ def perception() -> list[dict]:
     for count in (1, 2, 5, 10, 20):
         stacked = Stacked([Encoder() for _ in range(count)])
         crops = torch.rand(count, 1, 4, CROP_PX, CROP_PX)
-        together = milliseconds(lambda s=stacked, c=crops: s(c))
-        looped = milliseconds(lambda s=stacked, c=crops: s.one_by_one(c))
+        together = milliseconds(partial(stacked, crops))
+        looped = milliseconds(partial(stacked.one_by_one, crops))
         one = one or together
         rows.append({"what": f"encode {count} objects", "ms": together, "of a loop": together / looped,
                      f"of {count} x one": together / (count * one)})

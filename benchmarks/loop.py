@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import tempfile
 import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -57,7 +58,8 @@ def on_bus(recorder: bool) -> float:
 
 def main() -> None:
     """Prints a table; with a file's name, writes the numbers there."""
-    ways = {"one process": here, "bus": partial(on_bus, False), "bus, recorded": partial(on_bus, True)}
+    ways: dict[str, Callable[[], float]] = {"one process": here, "bus": partial(on_bus, False),
+                                            "bus, recorded": partial(on_bus, True)}
     Console().print(compared(in_turn(ways, ROUNDS), "where", ("one process", "bus")))
 
 

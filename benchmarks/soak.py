@@ -82,7 +82,8 @@ def soak(seed: int, folder: Path, counts: Counter, rng: random.Random) -> None:
 def main() -> None:
     """Prints a table; with a file's name, writes the numbers there, after every run."""
     minutes = float(sys.argv[1]) if len(sys.argv) > 1 else 30.0
-    end_s, counts, seed, rng = time.monotonic() + 60 * minutes, Counter(), 0, random.Random(0)
+    counts: Counter[str] = Counter()
+    end_s, seed, rng = time.monotonic() + 60 * minutes, 0, random.Random(0)
     with Console().status("killing") as status:
         while time.monotonic() < end_s:
             with tempfile.TemporaryDirectory() as folder:

@@ -52,14 +52,17 @@ def browser(url: str) -> Iterator[int]:
 
 def measure(view: bool, look: bool = False, suspend: str = "") -> float:
     """Steps per second. `suspend`: whom, once the run is under way."""
-    config, clock, pages = with_free_ports(CONFIG), Clock(), []
+    config, clock = with_free_ports(CONFIG), Clock()
+    pages: list[str] = []
     with tempfile.TemporaryDirectory() as folder, browser(url_of(config.viewer)) if look else nullcontext() as group:
         def see(topic, part, message) -> None:
             if topic == STATUS and part == VIEWER.name and message.note and look and not pages:
                 pages.append(message.note)
             clock.see(topic, part, message)
             if suspend and len(clock.seen_s) == SUSPENDED_AT:
-                os.killpg(group if suspend == "browser" else viewer_of(folder), signal.SIGSTOP)
+                whom = group if suspend == "browser" else viewer_of(folder)
+                assert whom is not None  # who suspends the browser looks with it
+                os.killpg(whom, signal.SIGSTOP)
 
         launch(config, Path(folder) / "loop", see, agent_processes("sceneccn", view=view), topics=(TRUTH,),
                say=lambda text: print(text, file=sys.stderr))

@@ -15,7 +15,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path
@@ -37,7 +37,7 @@ from saccade.shared.bus.transport import ZenohBus
 from saccade.shared.config import Config, load, weights_folder
 from saccade.shared.errors import SaccadeError
 from saccade.shared.log.folder import CONFIG_NAME, LOG_NAME
-from saccade.shared.loop.process import EXIT_ERROR
+from saccade.shared.loop.process import EXIT_ERROR, Item
 
 SHOWN = (PLAN, BELIEF, STATUS, RESULT)
 BEAT_S = 0.5
@@ -121,7 +121,8 @@ def prepare(config: Config, worlds: int, runs: Path) -> list[Path]:
 def _follow(folder: Path, processes: Sequence[Process], console: Console, worlds: int) -> list[Result]:
     config = load(folder / CONFIG_NAME)
     prefix = f"{config.bus.world}: " if worlds > 1 else ""
-    progress, arrived = Progress(judged=not config.bus.live), queue.SimpleQueue()
+    progress = Progress(judged=not config.bus.live)
+    arrived: queue.SimpleQueue[Item] = queue.SimpleQueue()
     view = FRAME if config.bus.live else TRUTH
 
     def tell(text: str) -> None:
@@ -146,7 +147,7 @@ def _follow(folder: Path, processes: Sequence[Process], console: Console, worlds
 class Elsewhere:
     """In the supervisor's place where others start the services: it hears them, and names those that fall silent."""
 
-    def __init__(self, names: Sequence[str], say) -> None:
+    def __init__(self, names: Sequence[str], say: Callable[[str], None]) -> None:
         self.stopped = False
         self._names, self._say = frozenset(names), say
         self._heard_s: dict[str, float] = {}

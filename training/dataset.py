@@ -28,7 +28,11 @@ def render_missing(run_dir: Path, config: TrainingConfig, progress: Callable[[st
             continue
         mesh = load_mesh(config.objects, name)
         total = config.views * len(default_shells_m(mesh.size_m))
-        views = render_views(mesh, count=config.views, progress=lambda done, n=name, t=total: progress(n, done, t))
+
+        def show(done: int, name: str = name, total: int = total) -> None:
+            progress(name, done, total)
+
+        views = render_views(mesh, count=config.views, progress=show)
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary = path.with_suffix(".tmp.npz")
         np.savez_compressed(temporary, tiles=views.tiles, shells_m=np.array(views.shells_m),

@@ -92,7 +92,7 @@ class FrameComposer:
     def _scene(self, rng: np.random.Generator):
         """A camera pose and objects [(which, centre [3], yaw)]: as the agent meets them, and as goals show them."""
         goal_like = rng.random() < GOAL_LIKE
-        placed = []
+        placed: list[tuple[int, NDArray[np.float64], float]] = []
         for which in self._chosen(goal_like, rng):
             placed.append((which, self._free_place(which, placed, rng), rng.uniform(0, 2 * np.pi)))
         if placed and (goal_like or rng.random() < 0.55):
@@ -176,7 +176,7 @@ class FrameComposer:
 
     def _warp(self, instances: list[_Instance]) -> list[Tensor]:
         """Each instance's layer [4, 120, 120], rgb premultiplied by coverage."""
-        layers: list[Tensor | None] = [None] * len(instances)
+        layers: dict[int, Tensor] = {}
         for level in range(LEVELS):
             chosen = [n for n, instance in enumerate(instances) if instance.level == level]
             if not chosen:
@@ -190,7 +190,7 @@ class FrameComposer:
             drawn = F.grid_sample(tiles, grid.view(-1, INPUT_PX, INPUT_PX, 2), align_corners=False)
             for n, layer in zip(chosen, drawn, strict=True):
                 layers[n] = layer
-        return layers
+        return [layers[n] for n in range(len(instances))]
 
     def _backgrounds(self, cameras: list, rng: np.random.Generator) -> Tensor:
         """The table in one colour on black, or two colours with a random border; rarely a texture all over."""

@@ -18,7 +18,7 @@ from saccade.training.frames import FrameBatch
 from saccade.training.paper_data import CleanViews, PaperFrames
 from saccade.training.pictures import draw_paper_extraction
 from saccade.training.settings import TrainingConfig
-from saccade.training.tasks import CcnTask, generator_of, split
+from saccade.training.tasks import CcnTask, generator_of, on_device, split
 
 KL_TRANSITION = 10.0  # lambda_4 (table of optimisation)
 MASKING, CROPPING, IDENTIFICATION = 10.0, 10.0, 10.0  # of errors summed over 64 x 64 x 3, as those of phase 1 are
@@ -55,11 +55,12 @@ class PaperExtractionTask:
         self.clean = CleanViews(mine, device)
         self.frames = PaperFrames(mine, [v for v in views if v.name != name], device)
         self.train_index, self.held_out = split(mine, config.seed, device)
-        frozen = nn.ModuleDict({"ccn": CCN("paper")})
-        frozen.load_state_dict(ccn)
-        self.ccn = frozen["ccn"].to(device, memory_format=torch.channels_last).eval().requires_grad_(False)
-        self.module = PaperExtraction().to(device, memory_format=torch.channels_last)
-        self.config, self.device, self.part, self.lambdas = config, device, part, []
+        frozen = CCN("paper")
+        nn.ModuleDict({"ccn": frozen}).load_state_dict(ccn)
+        self.ccn = on_device(frozen, device).eval().requires_grad_(False)
+        self.module = on_device(PaperExtraction(), device)
+        self.config, self.device, self.part = config, device, part
+        self.lambdas: list[float] = []
 
     def generator(self, *key: int) -> torch.Generator:
         return generator_of(self.config, self.part, self.device, *key)

@@ -73,7 +73,8 @@ class Trainer:
         self.steps, self.clip = self.config.steps(part), 5.0 if extraction and not paper else 5000.0
         self.optimizer = torch.optim.Adam(self.task.module.parameters(), lr=self.peak,
                                           amsgrad=not (paper and extraction))
-        self.step, self.seconds, self.smoothed, self.commit = 0, 0.0, {}, commit()
+        self.step, self.seconds, self.commit = 0, 0.0, commit()
+        self.smoothed: dict[str, float] = {}
         self.resume()
 
     def train(self) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import torch
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from saccade.services.perception.paper import CROP_SIDE_M
 from saccade.services.simulator.objects import load_mesh
@@ -42,7 +42,7 @@ def train(run_dir: Path, config: TrainingConfig, *, jobs: int, console: Console)
     columns = (TextColumn("{task.description:>24}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
                TextColumn("{task.fields[note]}"))
     with Progress(*columns, console=console) as progress:
-        bars: dict[str, int] = {}
+        bars: dict[str, TaskID] = {}
 
         def show(name: str, done: int, total: int, note: str = "") -> None:
             if name not in bars:
@@ -73,6 +73,7 @@ def _train_parts(run_dir: Path, config: TrainingConfig, jobs: int, show) -> None
                 if code is None:
                     continue
                 if code:
+                    assert process.stderr is not None  # it is a pipe
                     lines = process.stderr.read().strip().splitlines() or [f"exit code {code}"]
                     raise SaccadeError(f"training {part} stopped: {lines[-1].removeprefix('saccade: ')}")
                 del running[part]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import zlib
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -21,11 +22,18 @@ from saccade.training.settings import TrainingConfig
 
 IDENTITY_WEIGHT = 50.0
 
+Network = TypeVar("Network", bound=nn.Module)
+
 
 def generator_of(config: TrainingConfig, part: str, device: torch.device, *key: int) -> torch.Generator:
     """Randomness that depends on the seed, the part and the key (such as the step) alone."""
     entropy = [config.seed, zlib.crc32(part.encode()), *key]
     return torch.Generator(device).manual_seed(int(np.random.SeedSequence(entropy).generate_state(1)[0]))
+
+
+def on_device(module: Network, device: torch.device) -> Network:
+    """The module there, its channels last."""
+    return module.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]  # not in torch's stubs
 
 
 def split(views: ObjectViews, seed: int, device: torch.device) -> tuple[Tensor, Tensor]:
@@ -44,8 +52,10 @@ class CcnTask:
         mine = next(v for v in views if v.name == part)
         self.composer = self._composer(mine, [v for v in views if v.name != part], device)
         self.train_index, self.held_out = split(mine, config.seed, device)
-        self.module = nn.ModuleDict(self._networks()).to(device, memory_format=torch.channels_last)
-        self.ccn = self.module["ccn"]
+        self.module = on_device(nn.ModuleDict(self._networks()), device)
+        ccn = self.module["ccn"]
+        assert isinstance(ccn, CCN)
+        self.ccn = ccn
         self.device, self.lambdas, self.part = device, [80.0] * 3, part
 
     def _composer(self, mine: ObjectViews, others: list[ObjectViews], device: torch.device):
@@ -71,7 +81,9 @@ class CcnTask:
             present = self.composer.compose(pick(batch), generator) if clean else pair.first
         with torch.autocast(self.device.type, dtype=torch.bfloat16):
             loss, parts = loss_l1(self.ccn, pair, self.lambdas, generator)
-            identity = sum(identity_loss(self.module["identity"], crops) for crops in (present, mixed))
+            judge = self.module["identity"]
+            assert isinstance(judge, Identity)
+            identity = identity_loss(judge, present) + identity_loss(judge, mixed)
         return loss + IDENTITY_WEIGHT * identity, {**parts, "identity": float(identity.detach())}
 
     def after(self, step: int, smoothed: dict[str, float]) -> None:
@@ -93,8 +105,9 @@ class ExtractionTask:
     def __init__(self, config: TrainingConfig, views: list[ObjectViews], part: str, device: torch.device):
         torch.manual_seed(config.seed)
         self.composer = FrameComposer(views, device, config.seed)
-        self.module = Extraction(len(views)).to(device, memory_format=torch.channels_last)
-        self.config, self.device, self.lambdas = config, device, []
+        self.module = on_device(Extraction(len(views)), device)
+        self.config, self.device = config, device
+        self.lambdas: list[float] = []
 
     def loss(self, step: int) -> tuple[Tensor, dict[str, float]]:
         batch = self.composer.compose(self.config.batch_extraction, np.random.default_rng([self.config.seed, step]))

@@ -26,8 +26,8 @@ from saccade.app.provenance import machine, shown
 from saccade.app.run.registry import Pair, local_pairs, weight_hashes
 from saccade.services.simulator.objects import names_in_use
 from saccade.services.simulator.scenes import Scene, load_scenes
-from saccade.shared.bus.messages import Result
-from saccade.shared.bus.topics import RESULT
+from saccade.shared.bus.messages import Message, Result
+from saccade.shared.bus.topics import Topic
 from saccade.shared.config import Config
 from saccade.shared.errors import SaccadeError
 from saccade.shared.log.provenance import commit
@@ -53,6 +53,12 @@ class Plan:
     chosen: tuple[int, ...]
     out: Path
     suite: str | None = None
+
+    @property
+    def file(self) -> Path:
+        """That of the scenes."""
+        assert self.config.scene.file is not None  # since the configuration is resolved
+        return self.config.scene.file
 
     @property
     def partial(self) -> Path:
@@ -99,14 +105,13 @@ def spread(scenes: Sequence[Scene], limit: int | None) -> tuple[int, ...]:
 def facts(plan: Plan, command: str) -> dict[str, Any]:
     """Where the results come from: goes into the file, and decides whether a run may be taken up again."""
     config = plan.config.model_dump(mode="json")
-    file = plan.config.scene.file
-    config["scene"]["file"] = shown(file)
+    config["scene"]["file"] = shown(plan.file)
     if plan.config.perception.weights is not None:
         config["perception"]["weights"] = shown(plan.config.perception.weights)
-    digest = hashlib.sha256(file.read_bytes()).hexdigest()
+    digest = hashlib.sha256(plan.file.read_bytes()).hexdigest()
     return {"command": command, "commit": commit(), "agent": plan.agent, "objects": plan.config.scene.objects,
             "weights": weight_hashes(plan.agent, plan.config), "machine": machine(),
-            "scenes": {"suite": plan.suite, "file": shown(file), "sha256": digest}, "config": config}
+            "scenes": {"suite": plan.suite, "file": shown(plan.file), "sha256": digest}, "config": config}
 
 
 def bench(plan: Plan, *, jobs: int, command: str, console: Console, cluster: str | None = None) -> list[dict[str, Any]]:
@@ -134,7 +139,7 @@ def bench(plan: Plan, *, jobs: int, command: str, console: Console, cluster: str
         raise KeyboardInterrupt(f"the same command goes on from the {len(done)} scenes in {plan.partial}") from None
     records = [done[scene] for scene in wanted]
     _finish(plan, origin, records)
-    where = f"{plan.config.scene.objects}, {plan.suite or plan.config.scene.file.name}"
+    where = f"{plan.config.scene.objects}, {plan.suite or plan.file.name}"
     console.print(table.render(records, title=f"{plan.agent} on {where}, {len(records)} scenes"))
     console.print(f"written to {plan.out}")
     return records
@@ -210,8 +215,12 @@ def run_scene(agent: str, config_text: str, number: int) -> dict[str, Any]:
     results: list[Result] = []
     spent_ms: dict[str, list[float]] = {service.name: [] for service, _ in pairs}
     start = time.perf_counter()
-    run_local(pairs, config.scene.names, RUN, (number,),
-              lambda topic, part, message, payload: results.append(message) if topic == RESULT else None,
+
+    def hear(_topic: Topic, _part: str | None, message: Message, _payload: bytes | None) -> None:
+        if isinstance(message, Result):
+            results.append(message)
+
+    run_local(pairs, config.names, RUN, (number,), hear,
               on_step=lambda service, milliseconds: spent_ms[service].append(milliseconds))
     seconds = round(time.perf_counter() - start, 3)
     means = {service: round(fmean(values), 3) for service, values in spent_ms.items() if values}

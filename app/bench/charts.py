@@ -8,13 +8,14 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from saccade.app.bench.repeat import Again, Results, replay
 from saccade.app.bench.table import MEASURES, Record, wilson
 from saccade.app.look.picture import Story, image, new_figure, particles, save, table_from_above, way
 from saccade.app.palette import COLOURS
 from saccade.shared.bus.messages import Belief, Message
-from saccade.shared.bus.topics import BELIEF, Topic
+from saccade.shared.bus.topics import Topic
 from saccade.shared.world.task import MAX_STEPS, SUCCESS_ROTATION_RAD, SUCCESS_TRANSLATION_M
 
 VIEWS = (1, 5, 10, 20, 40)  # after so many the belief is drawn
@@ -49,7 +50,9 @@ def draw_objects(files: Sequence[Results], out: Path) -> None:
         axes.errorbar(places, [100 * s.value for s in shares], yerr=np.maximum(bars, 0.0), fmt="o-", capsize=3,
                       color=colour, label=file.label)
     axes.set(xlabel="objects on the table", ylabel="success (%)", ylim=(0, 104))
-    axes.xaxis.get_major_locator().set_params(integer=True)
+    locator = axes.xaxis.get_major_locator()
+    assert isinstance(locator, MaxNLocator)  # as of every linear axis
+    locator.set_params(integer=True)
     _legend(figure)
     save(figure, out)
 
@@ -86,7 +89,8 @@ def draw_gallery(cases: Sequence[tuple[str, Story]], out: Path) -> None:
     figure = new_figure((2.9 * len(cases), 6.6))
     for axes, (title, story) in zip(figure.subplots(2, len(cases), squeeze=False).T, cases, strict=True):
         image(axes[0], story.goal_rgb, f"{title}\ngoal")
-        image(axes[1], story.last_rgb, f"{'reached' if story.result.success else 'not reached'}\n"
+        reached = story.result is not None and story.result.success
+        image(axes[1], story.last_rgb, f"{'reached' if reached else 'not reached'}\n"
                                        f"last view, step {story.last_step}")
         for each in axes:
             each.title.set_fontsize(9)
@@ -107,8 +111,8 @@ def explore(again: Again, views: Sequence[int] = VIEWS) -> Exploration | None:
     number = max(range(len(again.scenes)), key=lambda k: (len(again.scenes[k].on_table), -k))
     kept: dict[int, dict[str, Belief]] = {}
 
-    def take(topic: Topic, part: str | None, message: Message) -> None:
-        if topic == BELIEF and message.step + 1 in views:
+    def take(_topic: Topic, part: str | None, message: Message) -> None:
+        if isinstance(message, Belief) and part is not None and message.step + 1 in views:
             kept.setdefault(message.step + 1, {})[part] = message
 
     story = replay(again.results.agent, config.model_dump_json(), number, take)
@@ -119,6 +123,7 @@ def draw_exploration(found: Exploration, out: Path) -> None:
     """The table from above after so many views: particles in colour, true positions black, the camera's path."""
     figure = new_figure((3.3 * len(found.beliefs), 4.2))
     path, truth = np.array(found.story.path_m), found.story.truth
+    assert truth is not None  # as of every episode that was run to its end
     for axes, (views, beliefs) in zip(np.atleast_1d(figure.subplots(1, len(found.beliefs))), found.beliefs.items(),
                                       strict=True):
         table_from_above(axes, f"after {views} view{'s' if views > 1 else ''}")

@@ -15,7 +15,7 @@ from saccade.app.bench.repeat import Again, replay
 from saccade.app.bench.workers import in_processes
 from saccade.app.look.picture import Story, draw_story
 from saccade.shared.bus.messages import Message, Truth
-from saccade.shared.bus.topics import TRUTH, Topic
+from saccade.shared.bus.topics import Topic
 from saccade.shared.world.geometry import direction, rotation_angle, unit, viewing_grid
 from saccade.shared.world.task import SUCCESS_ROTATION_RAD, SUCCESS_TRANSLATION_M
 
@@ -87,6 +87,8 @@ class Diagnosis:
 def diagnose(story: Story, ways: Sequence[Distance]) -> Diagnosis:
     """Compares what was believed at an episode's end with the truth; `ways` are the distances at each step."""
     truth, result = story.truth, story.result
+    assert truth is not None  # as of every episode that was run to its end
+    assert result is not None
     belief = story.beliefs.get(truth.target)
     position_error = direction_error = None
     if belief is not None:
@@ -106,8 +108,8 @@ def investigate(agent: str, config_text: str, number: int, picture: str) -> Diag
     """Runs a scene again, writes its picture, says what it shows."""
     ways: list[Distance] = []
 
-    def measure(topic: Topic, _part: str | None, message: Message) -> None:
-        if topic == TRUTH:
+    def measure(_topic: Topic, _part: str | None, message: Message) -> None:
+        if isinstance(message, Truth):
             ways.append(distance(message))
 
     story = replay(agent, config_text, number, measure)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -134,17 +134,18 @@ def replay(agent: str, config_text: str, number: int, take: Take | None = None) 
     story = Story(number)
 
     def hear(topic: Topic, part: str | None, message: Message, _payload: bytes | None) -> None:
-        story.take(topic, part, message)
+        story.take(part, message)
         if take is not None:
             take(topic, part, message)
 
-    run_local(pairs, config.scene.names, RUN, (number,), hear)
-    simulator = pairs[0][1]  # the last move has no frame
+    run_local(pairs, config.names, RUN, (number,), hear)
+    simulator: Any = pairs[0][1]  # the last move has no frame
     story.last_rgb, story.last_step = simulator.world.render(simulator.state.camera), simulator.state.step
     story.goal_is_known = story.goal_rgb is not None
     return story
 
 
-def same_as(story: Story, record: dict[str, Any]) -> bool:
+def same_as(story: Story, record: Mapping[str, Any]) -> bool:
     """Whether an episode ended as the record says."""
-    return all(record[key] == value for key, value in record_of(story.result).items())
+    ended = story.result
+    return ended is not None and all(record[key] == value for key, value in record_of(ended).items())

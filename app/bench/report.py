@@ -244,9 +244,11 @@ def _episodes(files: Sequence[Results], again: dict[Path, Any], out: Path, conso
         if explored is None and file.agent != ORACLE:
             explored = pictures.explore(ready)
     if explored is not None:
+        result = explored.story.result
+        assert result is not None  # as of every episode that was run to its end
         pictures.draw_exploration(explored, out / FOLDER / "exploration.png")
         lines += ["## Exploration", "", "Without a goal the camera goes where it expects to learn most about where the "
-                  f"objects are. Scene {explored.story.result.scene}.", "",
+                  f"objects are. Scene {result.scene}.", "",
                   f"![Belief after a number of views]({FOLDER}/exploration.png)", ""]
     return lines
 

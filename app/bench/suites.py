@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -21,8 +22,10 @@ from saccade.services.simulator.scenes import (
 from saccade.shared.config import Config
 from saccade.shared.errors import SaccadeError
 
+Yaw = Literal["random", "fixed"]
+
 YAW_SEED, ROOM_SEED = 31_415_000, 27_182_000
-DEV_SEEDS = {"fixed": 57_721_000, "random": 57_722_000}  # of the halves whose objects are not turned, and are
+DEV_SEEDS: dict[Yaw, int] = {"fixed": 57_721_000, "random": 57_722_000}  # of halves: objects not turned, and turned
 ROOM_GOALS = 20  # of each target
 DEV_REPEATS = 2  # in each half
 
@@ -36,7 +39,7 @@ class Suite:
     objects: str | None = None
 
 
-def _split(sizes: Sizes, seed: int, yaw: str, repeats: int = 20) -> list[Scene]:
+def _split(sizes: Sizes, seed: int, yaw: Yaw, repeats: int = 20) -> list[Scene]:
     return generate_split(sizes, seed=seed, counts=range(1, len(sizes) + 1), repeats=repeats, yaw=yaw)
 
 
@@ -45,7 +48,8 @@ def _room(sizes: Sizes, _seed: int) -> list[Scene]:
     rng, names = np.random.default_rng(ROOM_SEED), tuple(sizes)
     room = generate_scene(rng, sizes, names[0], len(names), yaw="fixed")
     present = [placed.name for placed in room.objects]
-    centers, extents = [p.center_m for p in room.objects], [sizes[name] for name in present]
+    centers = [p.center_m for p in room.objects]
+    extents = np.array([sizes[name] for name in present], dtype=np.float64)
     return [replace(room, id=f"lexa-{ROOM_GOALS * k + goal}", target=target,
                     goal_world_from_camera=draw_goal(rng, centers, extents, present.index(target)))
             for k, target in enumerate(names) for goal in range(ROOM_GOALS)]
@@ -86,5 +90,6 @@ def suite_file(name: str, config: Config, beside: Path) -> Path:
     if suite.file is not None:
         return suite.file
     sizes = {each: load_mesh(scene.objects, each).size_m for each in names_in_use(scene)}
+    assert suite.draw is not None  # each suite has the one or the other
     save_scenes(beside, suite.draw(sizes, config.seed))
     return beside

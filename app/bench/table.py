@@ -102,7 +102,8 @@ def summarise(name: str, records: Sequence[Record]) -> Row:
 
 def quartiles(values: Sequence[float]) -> tuple[float, float, float]:
     """First quartile, median and third quartile, between neighbours where they fall between two values."""
-    return tuple(quantiles([*values, *values] if len(values) == 1 else values, n=4, method="inclusive"))
+    low, middle, high = quantiles([*values, *values] if len(values) == 1 else values, n=4, method="inclusive")
+    return low, middle, high
 
 
 def milliseconds(records: Sequence[Record]) -> dict[str, float]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import logging
 import os
 import signal
 import threading
@@ -75,7 +76,7 @@ def _on_ray(function: Callable[..., Any], work: Work, cluster: str) -> Results:
         raise SaccadeError("--cluster needs Ray: pip install 'saccade[cluster]'") from error
     names = [name for name in ("MUJOCO_GL", "SACCADE_YCB") if name in os.environ]
     environment = dict.fromkeys(VARIABLES, "1") | {name: os.environ[name] for name in names}
-    join = functools.partial(ray.init, cluster, log_to_driver=False, logging_level="ERROR",
+    join = functools.partial(ray.init, cluster, log_to_driver=False, logging_level=logging.ERROR,
                              runtime_env={"env_vars": environment})
     try:
         try:

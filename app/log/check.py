@@ -9,8 +9,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from saccade.app.log.cut import Range, range_of
+from saccade.shared.bus.messages import Truth
 from saccade.shared.bus.sequences import Sequences
-from saccade.shared.bus.topics import RESULT, TOPICS, TRUTH
+from saccade.shared.bus.topics import RESULT, TOPICS
 from saccade.shared.log.reading import RunReader
 
 MOST_STRETCHES = 6  # of steps that are named one by one
@@ -70,7 +71,7 @@ def missing(path: Path) -> Missing:
             held.setdefault((message.run, message.episode), set()).add(key)
         elif topic.in_step:
             steps.setdefault((message.run, message.episode), {}).setdefault(message.step, set()).add(key)
-            if topic == TRUTH and message.done:
+            if isinstance(message, Truth) and message.done:
                 done.add((message.run, message.episode, message.step))
     live = json.loads(reader.configuration or "{}").get("bus", {}).get("live", False)
     if not live:

@@ -29,9 +29,11 @@ def range_of(reader: RunReader) -> Range | None:
     """Which steps a log was cut to, or recorded from; None for a whole one. Known once its first entry has been read.
     Raises SaccadeError where the log does not say it."""
     told = reader.metadata.get(CUT)
+    if not told:
+        return None
     try:
-        return Range(*(int(told[name]) if name == "start" or name in told else None
-                       for name in ("episode", "start", "end"))) if told else None
+        episode, end = (int(told[name]) if name in told else None for name in ("episode", "end"))
+        return Range(episode, int(told["start"]), end)
     except (KeyError, ValueError) as error:
         raise SaccadeError(f"log {reader.path} was cut, but does not say to which steps") from error
 
@@ -49,14 +51,15 @@ def cut(log: Path, out: Path, *, episode: int | None = None, start: int = 0, end
             for entry in reader.entries():
                 if target is None:
                     metadata = {name: told for name, told in reader.metadata.items() if name not in (LOG, ENDED_EARLY)}
-                    metadata[CUT] = {"episode": kept.episode, "start": kept.start, "end": kept.end}
+                    metadata[CUT] = {name: str(number) for name, number in vars(kept).items()}
                     target = RunLog(partial, world=reader.world, configuration=reader.configuration or "{}",
                                     metadata=metadata)
                 sequence = _kept(entry, kept, times)
                 if sequence is not None:
                     target.write(entry.topic, entry.part, entry.payload, sequence=sequence,
                                  log_time_ns=entry.log_time_ns)
-            target.close()
+            if target is not None:
+                target.close()
         except RecordingStopped as error:
             raise SaccadeError(f"{out} cannot be written: {error.__cause__ or error}") from error
     return kept
@@ -99,4 +102,6 @@ def _kept(entry: Recorded, kept: Range, times: tuple[int, int]) -> int | None:
     if not entry.topic.in_step:
         return message.seq if times[0] <= entry.log_time_ns <= times[1] else None
     first = 0 if entry.topic.latched else kept.start
-    return message.seq if message.episode == kept.episode and first <= message.step <= kept.end else None
+    if message.episode != kept.episode or message.step < first or (kept.end is not None and message.step > kept.end):
+        return None
+    return message.seq

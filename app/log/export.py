@@ -27,14 +27,16 @@ def export_foxglove(log: Path, out: Path, *, console: Console | None = None) -> 
         from saccade.app.log.foxglove import Scene
         from saccade.app.log.plottable import Values
 
-    source, scene, progress = Log(log, console), None, None
+    source = Log(log, console)
+    shown: tuple[Scene, Progress] | None = None
     with whole(out) as partial, partial.open("wb") as stream:
         file = FoxgloveFile(stream)
         for entry, message in source:
-            if scene is None:
-                scene = Scene(goal_view_is_known=source.goal_view_is_known)
-                progress = Progress(judged=source.goal_view_is_known)
+            if shown is None:
+                known = source.goal_view_is_known
+                shown = Scene(goal_view_is_known=known), Progress(judged=known)
                 file.attach(CONFIGURATION, source.reader.configuration, entry.log_time_ns)
+            scene, progress = shown
             for name, told in scene.take(entry.topic, entry.part, message, entry.log_time_ns):
                 file.write(name, told, entry.log_time_ns)
             progress.take(entry.topic, entry.part, message)

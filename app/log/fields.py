@@ -19,7 +19,8 @@ def kinds(message_type: type[Message]) -> dict[str, Any]:
 
 def fixed_numbers(spec: ArraySpec) -> int | None:
     """How many numbers an array always has; None where a dimension is free."""
-    return None if any(isinstance(side, str) for side in spec.shape) else math.prod(spec.shape)
+    sides = [side for side in spec.shape if not isinstance(side, str)]
+    return math.prod(sides) if len(sides) == len(spec.shape) else None
 
 
 def _kind(hint: Any) -> Any:

@@ -8,7 +8,7 @@ looks, +x is right, +y down; ours looks along -z and has +y up. Both viewers dra
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import foxglove.messages as fm
@@ -52,7 +52,8 @@ class Scene:
 
     def take(self, topic: Topic, part: str | None, message: Message, time_ns: int) -> Iterator[Told]:
         """What there is to show of a message, logged at `time_ns`."""
-        show = {FRAME: self._frame, GOAL: self._goal, BELIEF: self._belief, PLAN: self._plan, TRUTH: self._truth}
+        show: dict[Topic, Callable[[Any, fm.Timestamp], Iterator[Told]]] = {
+            FRAME: self._frame, GOAL: self._goal, BELIEF: self._belief, PLAN: self._plan, TRUTH: self._truth}
         if part is not None and topic.in_step:
             self._objects.add(part)
         if topic in show:
@@ -152,7 +153,7 @@ def depth_image(depth_m: NDArray[np.float32], frame: str, at: fm.Timestamp) -> f
 def calibration(intrinsics_px: ArrayLike, size_px: tuple[int, int], frame: str,
                 at: fm.Timestamp) -> fm.CameraCalibration:
     """A pinhole camera of (fx, fy, cx, cy) and (height, width) in pixels, without distortion."""
-    fx, fy, cx, cy = (float(x) for x in intrinsics_px)
+    fx, fy, cx, cy = (float(x) for x in np.asarray(intrinsics_px))
     height, width = size_px
     return fm.CameraCalibration(timestamp=at, frame_id=frame, width=width, height=height,
                                 K=[fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0], R=np.eye(3).ravel().tolist(),
@@ -191,7 +192,7 @@ def label(text: str, at_m: ArrayLike, rgb: tuple[float, float, float]) -> fm.Tex
                             text=text)
 
 
-def update(name: str, at: fm.Timestamp, **primitives: list[Any]) -> fm.SceneUpdate:
+def update(name: str, at: fm.Timestamp, **primitives: Any) -> fm.SceneUpdate:
     """One entity in the world, which replaces that of the same name on its topic."""
     return fm.SceneUpdate(entities=[fm.SceneEntity(timestamp=at, frame_id=WORLD, id=name, **primitives)])
 
@@ -203,7 +204,7 @@ def pose(rotation: ArrayLike, position_m: ArrayLike) -> fm.Pose:
 
 def vector(xyz: ArrayLike) -> fm.Vector3:
     """Three numbers."""
-    x, y, z = (float(value) for value in xyz)
+    x, y, z = (float(value) for value in np.asarray(xyz))
     return fm.Vector3(x=x, y=y, z=z)
 
 

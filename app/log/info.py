@@ -12,7 +12,6 @@ from saccade.app.log.recover import RECOVERED
 from saccade.app.log.traffic import Keys
 from saccade.shared.bus.messages import Result
 from saccade.shared.bus.sequences import Sequences
-from saccade.shared.bus.topics import RESULT
 from saccade.shared.bus.wire import MessageError, decode
 from saccade.shared.log.reading import RunReader
 
@@ -59,7 +58,7 @@ def gather(log: Path) -> LogInfo:
         if message is None or not topic.in_step:
             continue
         info.steps[message.episode] = max(info.steps.get(message.episode, 0), message.step)
-        if topic == RESULT:
+        if isinstance(message, Result):
             info.results[message.episode] = message
     info.kept = range_of(reader)
     return info

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import zstandard
 from mcap import records as mcap
@@ -24,7 +24,8 @@ from saccade.shared.log.reading import DAMAGE, MAX_RECORD_BYTES
 
 HEAD = struct.Struct("<BQ")  # of every record: opcode and length
 BROKEN = (*DAMAGE, RuntimeError)  # the last is what lz4 raises
-TYPES = {opcode: getattr(mcap, "".join(word.title() for word in opcode.name.split("_"))) for opcode in Opcode}
+TYPES: dict[int, Any] = {
+    opcode: getattr(mcap, "".join(word.title() for word in opcode.name.split("_"))) for opcode in Opcode}
 # where reading may start again: a record of one of these kinds, shorter than a terabyte
 ANCHOR = re.compile(rb"(?=[%b](?s:.{5})\x00\x00\x00)" % bytes((
     Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT, Opcode.METADATA, Opcode.DATA_END)))
@@ -143,6 +144,8 @@ class Salvage:
         if opcode != Opcode.FOOTER or stop != end:
             return
         footer = self._parse(stream, start, opcode, end)
+        if not isinstance(footer, mcap.Footer):
+            return
         if not 0 < footer.summary_start < start or start - footer.summary_start > MAX_RECORD_BYTES:
             return
         stream.seek(footer.summary_start)

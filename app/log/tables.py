@@ -71,8 +71,12 @@ def columns(topic: Topic) -> list[Column]:
         result.append(Column(pa.field("part", pa.string()), lambda entry, _: entry.part))
     for name, kind in kinds(topic.type).items():
         result += _of_array(name, kind) if isinstance(kind, ArraySpec) else [
-            Column(pa.field(name, TYPES[kind]), lambda _, message, name=name: getattr(message, name))]
+            Column(pa.field(name, TYPES[kind]), _value(name))]
     return result
+
+
+def _value(name: str) -> Callable[[Recorded, Message], Any]:
+    return lambda _, message: getattr(message, name)
 
 
 def _of_array(name: str, spec: ArraySpec) -> list[Column]:

@@ -98,9 +98,13 @@ def of_array(value: np.ndarray) -> str:
         return f"{kind}, empty"
     if value.size <= MOST_NUMBERS:
         numbers = np.array2string(value, separator=", ", max_line_width=10_000,
-                                  formatter={"all": lambda number: f"{number + 0:.6g}"})
+                                  formatter={"all": _number})
         return f"{kind} " + " ".join(numbers.split())
     return f"{kind}, min {value.min():.6g}, mean {value.mean(dtype=np.float64):.6g}, max {value.max():.6g}"
+
+
+def _number(value: Any) -> str:
+    return f"{value + 0:.6g}"
 
 
 def text(words: str) -> str:

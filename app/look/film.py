@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -24,8 +25,8 @@ from saccade.services.viewer.curves import entropy_nats
 from saccade.services.viewer.images import outline
 from saccade.services.viewer.imagination import Imagination
 from saccade.services.viewer.words import decision, ending, plain
-from saccade.shared.bus.messages import Message, Percept
-from saccade.shared.bus.topics import BELIEF, FRAME, PERCEPT, PLAN, RESULT, TRUTH, Topic
+from saccade.shared.bus.messages import Belief, Message, Percept, Plan, Result, Truth
+from saccade.shared.bus.topics import FRAME, PERCEPT, Topic
 from saccade.shared.config import Config, validate
 from saccade.shared.errors import SaccadeError
 from saccade.shared.log.reading import RunReader
@@ -56,21 +57,21 @@ class Scene:
         """Notes what a message of this episode says."""
         if topic == FRAME:
             self.percepts = {}
-        self.story.take(topic, part, message)
-        if topic == PERCEPT:
+        self.story.take(part, message)
+        if isinstance(message, Percept) and topic == PERCEPT and part is not None:
             self.percepts[part] = message
             if message.presence > PRESENT_ABOVE:
                 self.seen[part] = message
-        elif topic == BELIEF:
+        elif isinstance(message, Belief) and part is not None:
             self.entropies.setdefault(part, {})[message.step] = entropy_nats(message)
-        elif topic == PLAN:
+        elif isinstance(message, Plan):
             self.words = decision(message, self.story.beliefs.values())
             if message.believed_distance_m >= 0:
                 self.believed_m[message.step] = message.believed_distance_m
-        elif topic == TRUTH:
+        elif isinstance(message, Truth):
             apart = message.world_from_camera - message.goal_world_from_camera
             self.true_m[message.step] = float(np.linalg.norm(apart[:3, 3]))
-        elif topic == RESULT:
+        elif isinstance(message, Result):
             self.words = ending(message)
 
 
@@ -88,11 +89,12 @@ def film(log: Path, out: Path, *, episode: int | None, rate_hz: float, console: 
     with whole(out) as partial, (_gif if gif else _mp4)(partial, rate_hz) as write:
         shots = track(scenes(log, episode), total=steps[episode], console=console, description="filming",
                       transient=True)
-        shown = None
+        shown: Picture | None = None
         for scene, imagination in shots:
             shown = picture_of(scene, imagination, GIF_DPI if gif else DPI)
             write(shown, 1)
-        write(shown, round(LAST_S * rate_hz))
+        if shown is not None:
+            write(shown, round(LAST_S * rate_hz))
 
 
 def steps_of(log: Path) -> dict[int, int]:
@@ -143,14 +145,18 @@ def picture_of(scene: Scene, imagination: Imagination | None, dpi: int) -> Pictu
     image(figure.add_subplot(grid[1, 2]), planned, "planned view, imagined")
     _curves(figure, grid, scene, of_object)
     figure.suptitle(f"step {story.last_step}    {scene.words}", x=0.02, ha="left", fontsize=13)
-    figure.canvas.draw()
-    return np.ascontiguousarray(np.asarray(figure.canvas.buffer_rgba())[..., :3])
+    canvas = figure.canvas
+    assert isinstance(canvas, FigureCanvasAgg)  # as of every new figure
+    canvas.draw()
+    return np.ascontiguousarray(np.asarray(canvas.buffer_rgba())[..., :3])
 
 
 def _camera(axes: Axes, scene: Scene, imagination: Imagination | None, of_object: dict[str, str]) -> None:
     """What the camera sees: mask and name of each object in it, and the crop that its network looks at."""
     rgb = scene.story.last_rgb
     image(axes, rgb, "camera")
+    if rgb is None:
+        return
     for name, percept in scene.percepts.items():
         if percept.presence <= PRESENT_ABOVE:
             continue
@@ -161,7 +167,8 @@ def _camera(axes: Axes, scene: Scene, imagination: Imagination | None, of_object
         if imagination:
             ring = imagination.frame_of(percept)
             axes.plot(*ring.T, color=colour, linewidth=1, linestyle=":")
-        axes.text(*percept.pixel, f"{plain(name)} {percept.presence:.2f}", color="white", fontsize=9, ha="center",
+        u, v = percept.pixel
+        axes.text(u, v, f"{plain(name)} {percept.presence:.2f}", color="white", fontsize=9, ha="center",
                   clip_on=True, bbox={"facecolor": colour, "edgecolor": "none", "pad": 2})
     axes.set(xlim=(0, rgb.shape[1]), ylim=(rgb.shape[0], 0))
 
@@ -173,7 +180,8 @@ def _table(axes: Axes, scene: Scene) -> None:
     particles(axes, {n: b for n, b in story.beliefs.items() if b.presence > PRESENT_ABOVE}, story.beliefs)
     if story.plan is not None:
         if story.plan.best_eyes_m is not None:
-            axes.scatter(*story.plan.best_eyes_m[:, :2].T, c=story.plan.best_g, cmap="RdYlGn_r", s=8, alpha=0.7)
+            x_m, y_m = story.plan.best_eyes_m[:, :2].T
+            axes.scatter(x_m, y_m, c=story.plan.best_g, cmap="RdYlGn_r", s=8, alpha=0.7)
         axes.plot(*story.plan.viewpoint[:2, 3], "D", color="#e0a800", markersize=9, markeredgecolor="black",
                   label="chosen viewpoint")
     if story.truth is not None and story.goal_is_known:

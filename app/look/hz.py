@@ -81,14 +81,14 @@ def hz(key: str, *, log: Path | None, count: int | None, endpoint: str | None, r
         with closing(live(wanted, endpoint=endpoint, run=run)) as source:
             follow(source, count, console)
         return
-    source, rates = Logged(wanted, log_of(log)), Rates(most=None)
-    for heard in source.heard():
+    logged, rates = Logged(wanted, log_of(log)), Rates(most=None)
+    for heard in logged.heard():
         rates.take(heard.topic, heard.part, len(heard.payload), heard.time_ns / 1e9)
         if rates.total == count:
             break
-    _tell(console, rates, source.world)
-    if source.reader.cut:
-        say(console, source.reader.cut)
+    _tell(console, rates, logged.world)
+    if logged.reader.cut:
+        say(console, logged.reader.cut)
 
 
 def follow(source: Live, count: int | None, console: Console) -> Rates:

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from saccade.app.palette import COLOURS
 from saccade.services.simulator.world import TABLE_SIDE_M
-from saccade.shared.bus.messages import Belief, Message, Plan, Result, Truth
-from saccade.shared.bus.topics import BELIEF, FRAME, GOAL, PLAN, RESULT, TRUTH, Topic
+from saccade.shared.bus.messages import Belief, Frame, Goal, Message, Plan, Result, Truth
+from saccade.shared.bus.topics import BELIEF, FRAME, GOAL, PLAN, RESULT, TRUTH
 from saccade.shared.errors import SaccadeError
 from saccade.shared.log.folder import LOG_NAME, PICTURE_NAME
 from saccade.shared.log.reading import RunReader
@@ -53,23 +53,23 @@ class Story:
         """The camera's positions in their order."""
         return [self.ways[step] for step in sorted(self.ways)]
 
-    def take(self, topic: Topic, part: str | None, message: Message) -> None:
+    def take(self, part: str | None, message: Message) -> None:
         """Notes what a message of this episode says."""
-        if topic == GOAL:
+        if isinstance(message, Goal):
             self.goal_rgb = message.rgb
-        elif topic == FRAME:
+        elif isinstance(message, Frame):
             self.last_rgb, self.last_step = message.rgb, message.step
-        elif topic == BELIEF:
+        elif isinstance(message, Belief) and part is not None:
             self.beliefs[part] = message
             terms = np.array([getattr(message, name) for name in F_TERMS])
             self.energies[message.step] = self.energies.get(message.step, 0.0) + terms
-        elif topic == TRUTH:
+        elif isinstance(message, Truth):
             self.truth = message
-        elif topic == PLAN:
+        elif isinstance(message, Plan):
             self.plan = message
-        elif topic == RESULT:
+        elif isinstance(message, Result):
             self.result = message
-        if topic in (FRAME, TRUTH):  # the last step has a truth and no frame; a real camera has frames and no truth
+        if isinstance(message, Frame | Truth):  # the last step has a truth and no frame, a real camera frames alone
             self.ways[message.step] = message.world_from_camera[:3, 3]
 
 
@@ -83,7 +83,7 @@ def read_story(log: Path, episode: int | None = None) -> Story:
         if episode is None and message.episode > story.episode:
             story = Story(message.episode)
         if message.episode == story.episode:
-            story.take(topic, part, message)
+            story.take(part, message)
     if story.last_rgb is None:
         which = "no episode" if episode is None else f"nothing of episode {episode}"
         raise SaccadeError(f"log {log} has {which} in it: draw a log that holds frames")
@@ -182,7 +182,8 @@ def particles(axes: Axes, beliefs: dict[str, Belief], names: Iterable[str]) -> N
     """Where objects are believed to be; each of `names` keeps its colour, whichever of them are drawn."""
     for name, colour in colours(names).items():
         if name in beliefs:
-            axes.scatter(*beliefs[name].particles_m[:, :2].T, s=4, color=colour, alpha=0.35, linewidths=0, zorder=2)
+            x_m, y_m = beliefs[name].particles_m[:, :2].T
+            axes.scatter(x_m, y_m, s=4, color=colour, alpha=0.35, linewidths=0, zorder=2)
             axes.plot(*beliefs[name].mean_m[:2], "o", color=colour, markersize=7, label=name, zorder=3)
 
 

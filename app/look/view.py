@@ -99,7 +99,8 @@ def _show(log: Log, recording: rr.RecordingStream, truth: bool, weights: Path | 
             config = validate(json.loads(log.reader.configuration or "{}"), f"the log {log.reader.path}")
             viewer = Viewer(recording, _with_weights(config, weights), truth=truth, live=False)
         viewer.take(entry.topic, entry.part, message)
-    _tell(viewer.close(), log.console)
+    if viewer is not None:
+        _tell(viewer.close(), log.console)
 
 
 def _tell(lacks: list[str], console: Console) -> None:

@@ -6,6 +6,7 @@ from collections import defaultdict
 from collections.abc import Callable
 from itertools import cycle
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -42,8 +43,8 @@ def _place(old: Belief, new: Belief) -> float | None:
 def _goal_view(old: Belief, new: Belief) -> float | None:
     if old.goal_log_posterior is None or new.goal_log_posterior is None:
         return None
-    directions = [_peak(belief.goal_log_posterior) for belief in (old, new)]
-    return float(np.arccos(np.clip(directions[0] @ directions[1], -1, 1)))
+    cosine = _peak(old.goal_log_posterior) @ _peak(new.goal_log_posterior)
+    return float(np.arccos(np.clip(cosine, -1, 1)))
 
 
 def _peak(log_posterior: NDArray[np.float32]) -> NDArray[np.float64]:
@@ -54,7 +55,7 @@ def _peak(log_posterior: NDArray[np.float32]) -> NDArray[np.float64]:
 
 
 # By topic: what is measured, with its unit. None where one of the two has nothing to measure.
-MEASURES: dict[str, dict[str, Callable[[Message, Message], float | None]]] = {
+MEASURES: dict[str, dict[str, Callable[[Any, Any], float | None]]] = {
     "percept": {"presence": lambda old, new: abs(new.presence - old.presence), "pixel (px)": _pixel,
                 "log scale": _log_scale},
     "belief": {"presence": lambda old, new: abs(new.presence - old.presence), "position (cm)": _place,

@@ -44,16 +44,16 @@ class Progress:
             if self.at is not None and message.episode != self.at[0]:
                 self.plan, self.declared, self.beliefs = None, None, {}
             self.at = message.episode, message.step
-        if topic == TRUTH:
+        if isinstance(message, Truth):
             self.truth = message
-        elif topic == PLAN:
+        elif isinstance(message, Plan):
             self.plan = message
             self.declared = self.declared or (message if message.arrived else None)
-        elif topic == BELIEF:
+        elif isinstance(message, Belief) and part is not None:
             self.beliefs[part] = message
-        elif topic == STATUS:
+        elif isinstance(message, Status) and part is not None:
             self.statuses[part] = message
-        elif topic == RESULT:
+        elif isinstance(message, Result):
             self.results.append(message)
 
     @property
@@ -148,7 +148,8 @@ class Display:
 
     def __init__(self, console: Console, *, plain: bool, judged: bool = True, camera: str | None = None) -> None:
         self.progress, self.console = Progress(judged=judged), console
-        self._camera, self._told = camera, set()
+        self._camera = camera
+        self._told: set[str] = set()
         self.plain = plain or not console.is_terminal
         self._live = Live(get_renderable=lambda: panel(self.progress), console=console, transient=True,
                           refresh_per_second=PER_SECOND)
@@ -179,7 +180,7 @@ class Display:
     def take(self, topic: Topic, part: str | None, message: Message) -> None:
         """To be called with every message of these topics."""
         self.progress.take(topic, part, message)
-        if topic == STATUS and part == self._camera:
+        if isinstance(message, Status) and part == self._camera:
             self.note(message.note)
         if self.plain and topic == self._view and message.step % LINE_EVERY == 0:
             say(self.console, line(self.progress))

@@ -59,12 +59,13 @@ def _camera_lines(config: Config, progress: Progress) -> list[str]:
     if without_pose:
         told.append(f"{without_pose} images without a pose were left out")
     lines = ["; ".join(told + [f"{name} skipped {count}" for name, count in skipped.items()])]
-    if config.scene.explore:
+    goal_image = config.scene.goal_image
+    if config.scene.explore or goal_image is None:
         return lines
     said = "does not say that it is there"
     if progress.declared is not None:
         said = f"says at view {progress.declared.step} that it is there"
-    elif progress.believed_distance_m is not None:
+    elif progress.plan is not None and progress.believed_distance_m is not None:
         where = ", ".join(f"{x:.2f}" for x in progress.plan.viewpoint[:3, 3])
         said += f"; it would move to ({where}) m"
-    return [*lines, f"goal image {config.scene.goal_image.name}: the agent {said}"]
+    return [*lines, f"goal image {goal_image.name}: the agent {said}"]

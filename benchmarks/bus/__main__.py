@@ -63,10 +63,10 @@ def measure(plan: Plan, contenders: Iterable[Contender]) -> dict[str, Any]:
 def _row(name: str, kind: str, rounds: Latencies) -> dict[str, Any]:
     """Percentiles over all rounds, milliseconds, and each round's median by itself."""
 
-    def p50(key: tuple[str, str]) -> float | None:
-        return float(np.median(np.concatenate(rounds[key]))) / 1e6 if rounds.get(key) else None
+    def p50(key: tuple[str, str]) -> float:
+        return float(np.median(np.concatenate(rounds[key]))) / 1e6
 
-    median, ours = p50((name, kind)), p50((OURS, kind))
+    median, ours = p50((name, kind)), p50((OURS, kind)) if rounds.get((OURS, kind)) else None
     times = np.concatenate(rounds[name, kind])
     return {"transport": name, "payload": kind, "messages": len(times), "p50_ms": median,
             "p99_ms": float(np.percentile(times, 99)) / 1e6,

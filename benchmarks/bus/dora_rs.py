@@ -29,8 +29,9 @@ class DoraRs:
     def run(self, plan: Plan, folder: Path) -> None:
         """dora starts both ends itself."""
         python, *_ = command(self.name, SENDER, folder, "-")
-        nodes = [{"id": role, "path": python, "args": shlex.join(command(self.name, role, folder, "-")[1:])}
-                 for role in ROLES]
+        nodes: list[dict[str, object]] = [
+            {"id": role, "path": python, "args": shlex.join(command(self.name, role, folder, "-")[1:])}
+            for role in ROLES]
         nodes[ROLES.index(SENDER)]["outputs"] = [OUTPUT]
         nodes[ROLES.index(RECEIVER)]["inputs"] = {OUTPUT: {"source": f"{SENDER}/{OUTPUT}", "queue_size": QUEUE_SIZE}}
         dataflow = folder / "dataflow.yml"

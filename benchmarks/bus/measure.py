@@ -26,7 +26,7 @@ PROBE_S = 0.05
 SETTLE_S = 0.2
 READY = "ready"
 
-Send = Callable[[bytes], None]  # wire bytes on their way
+Send = Callable[[bytes], object]  # wire bytes on their way
 Receive = Callable[[], Any]  # waits for the next message and gives a readable buffer of its bytes
 
 

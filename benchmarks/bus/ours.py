@@ -55,7 +55,13 @@ class Ours:
         inbox = Inbox()
         with closing(self._bus(address)) as bus:
             bus.subscribe((FRAME,), inbox.put)
-            yield lambda: inbox.get()[2]
+
+            def receive() -> bytes:
+                item = inbox.get()
+                assert item is not None  # nobody stops this inbox
+                return item[2]
+
+            yield receive
 
     def _bus(self, endpoint: str) -> ZenohBus:
         with nullcontext() if self._shared_memory else _no_shared_memory():

@@ -35,7 +35,10 @@ class Contender(Protocol):
     """A way to bring bytes from one process to another."""
 
     name: str
-    modules: tuple[str, ...]  # that must be installed
+
+    @property
+    def modules(self) -> tuple[str, ...]:
+        """What must be installed."""
 
     def run(self, plan: Plan, folder: Path) -> None:
         """Starts both ends, sees them through and cleans up. Raises SaccadeError if that fails."""

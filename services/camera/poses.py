@@ -128,10 +128,8 @@ def _json_line(line: str) -> tuple[Key, Array]:
         raise ValueError(f"not JSON ({error})") from error
     if not isinstance(tree, dict) or "world_from_camera" not in tree or len(tree) > 2:
         raise ValueError('give {"world_from_camera": 4x4} and one of image, index and time_s')
-    value: Any
     kind, value = next(((k, v) for k, v in tree.items() if k != "world_from_camera"), STILL)
-    kinds: dict[str, type | tuple[type, ...]] = {"image": str, "index": int, "time_s": (int, float),
-                                                 "still": type(None)}
+    kinds: dict[str, Any] = {"image": str, "index": int, "time_s": (int, float), "still": type(None)}
     if kind not in kinds:
         raise ValueError(f"unknown key {kind!r}: give one of image, index and time_s")
     if not isinstance(value, kinds[kind]) or isinstance(value, bool):

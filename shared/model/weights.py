@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -100,8 +101,8 @@ class Weights:
         return module.eval()
 
 
-def write_weights(folder: Path, states: dict[str, dict[str, ArrayLike]], cards: tuple[ObjectCard, ...],
-                  facts: dict) -> None:
+def write_weights(folder: Path, states: Mapping[str, Mapping[str, ArrayLike]], cards: tuple[ObjectCard, ...],
+                  facts: dict[str, Any]) -> None:
     """Writes the states in half precision and the manifest with their hashes."""
     folder.mkdir(parents=True, exist_ok=True)
     hashes = {}
