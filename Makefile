@@ -2,7 +2,7 @@
 PYTHON ?= python3
 SACCADE = .venv/bin/saccade
 
-.PHONY: run up test test-compose lint bench fixtures clean
+.PHONY: run up test test-compose test-package lint bench fixtures clean
 
 run: .venv/.installed
 	$(SACCADE) run --view
@@ -18,9 +18,16 @@ up:
 test-compose: .venv/.installed-dev
 	.venv/bin/python -m pytest -q tests/compose
 
+# mypy does not follow an editable installation: it finds `saccade` through a link.
 lint: .venv/.installed-dev
 	.venv/bin/ruff check .
 	.venv/bin/lint-imports
+	mkdir -p .venv/names && ln -sfn ../.. .venv/names/saccade
+	.venv/bin/mypy
+
+# Builds a wheel, installs it into an empty environment and uses it there.
+test-package: .venv/.installed-dev
+	.venv/bin/python -m pytest -q tests/package
 
 fixtures: .venv/.installed-dev
 	.venv/bin/python -m saccade.tests.fixtures.make
@@ -28,7 +35,7 @@ fixtures: .venv/.installed-dev
 bench: .venv/.installed
 	$(SACCADE) bench --objects pantry --jobs 2 --json bench/pantry.json
 
-.venv/.installed: pyproject.toml deploy/setup.sh
+.venv/.installed: pyproject.toml setup.py deploy/setup.sh
 	sh deploy/setup.sh $(PYTHON)
 	touch $@
 
@@ -37,4 +44,4 @@ bench: .venv/.installed
 	touch $@
 
 clean:
-	rm -rf .venv build *.egg-info .pytest_cache .ruff_cache
+	rm -rf .venv build dist site *.egg-info .pytest_cache .ruff_cache

@@ -2,6 +2,7 @@
 folders, and a distribution carries the commit that it was built from."""
 
 import os
+import shutil
 import subprocess
 from pathlib import Path
 
@@ -25,9 +26,14 @@ def commit() -> str:
 
 class BuildWithCommit(build_py):
     def run(self) -> None:
+        if not self.editable_mode:
+            shutil.rmtree(self.build_lib, ignore_errors=True)  # or modules that are gone would be packed
         super().run()
         if not self.editable_mode:
             Path(self.build_lib, "saccade", COMMIT).write_text(commit() + "\n")
+
+    def find_package_modules(self, package: str, package_dir: str) -> list[tuple[str, str, str]]:
+        return [module for module in super().find_package_modules(package, package_dir) if module[1] != "setup"]
 
 
 class SdistWithCommit(sdist):

@@ -29,7 +29,7 @@ from saccade.shared.config import Config, load
 from saccade.shared.errors import SaccadeError
 
 DEFAULT_AGENT = "sceneccn"
-NICKNAMES = {"bus": "bus.kind"}  # keywords that name a section, and mean this key of it where they are no dictionary
+NICKNAMES = {"bus": "bus.kind", "source": "camera.source"}  # what these keywords mean, of what they could mean
 
 
 @dataclass(frozen=True)

@@ -6,73 +6,25 @@ A probability is doubled to 0.99 at most. What is done already in `out.json` is 
 
 from __future__ import annotations
 
-import ast
 import json
 import math
 import sys
-from collections.abc import Iterator
-from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from statistics import fmean, median, stdev
 from typing import Any
 
 from saccade.app.bench.bench import RUN, prepare, record_of
+from saccade.app.constants import SECTIONS, Constant, constants
 from saccade.app.run.registry import local_pairs
-from saccade.shared.bus.topics import RESULT
-from saccade.shared.config import PACKAGE, BeliefConfig, Config, PlannerConfig
+from saccade.shared.bus.messages import Message, Result
+from saccade.shared.bus.topics import Topic
+from saccade.shared.config import Config
 from saccade.shared.log.provenance import commit
 from saccade.shared.loop.local import run_local
 
-MODULES = ("services.belief.core", "services.belief.pose", "services.belief.position", "services.planner.core",
-           "services.planner.free_energy")
-SECTIONS = {"belief": BeliefConfig, "planner": PlannerConfig}
-KINDS = ("chosen", "derived", "measured", "from the")  # what a constant's comment begins with
-SHOWN = ("planner.step_m", "belief.published_particles")  # the paper's, and one that only the viewer sees
-PROBABILITIES = {"BORN_VAGUE", "SURE", "DETECTED", "USED_VIEW", "belief.present_above", "planner.goal_confidence",
-                 "belief.resample_below", "belief.view_worth", "belief.missed_weight"}
 SCENES = 100
 DEPENDENT = {"USED_VIEW": "HALF_VIEW_TANGENT"}  # a constant that is computed from another
-
-
-@dataclass(frozen=True)
-class Constant:
-    """A number of the agent's own making. `where`: a module of this package, or the section of the configuration."""
-
-    where: str
-    name: str
-    value: float
-    comment: str
-
-    @property
-    def label(self) -> str:
-        """Its name in the results."""
-        return f"{self.where}.{self.name}"
-
-    def changed(self, factor: float) -> float:
-        """Half or twice the value, whole where it is a whole number, a probability where it is one."""
-        value = self.value * factor
-        if self.name in PROBABILITIES or self.label in PROBABILITIES:
-            value = min(value, 0.99)
-        return max(1, round(value)) if isinstance(self.value, int) else value
-
-
-def constants() -> Iterator[Constant]:
-    """All of them, in the order of the source: those whose comment says where the number is from, and the numbers of
-    the configuration."""
-    for module in MODULES:
-        source = (PACKAGE / Path(*module.split("."))).with_suffix(".py").read_text()
-        lines = source.splitlines()
-        for node in ast.parse(source).body:
-            if isinstance(node, ast.Assign) and isinstance(node.value, ast.Constant):
-                _, _, comment = lines[node.lineno - 1].partition("#")
-                name, value = node.targets[0], node.value.value
-                if isinstance(name, ast.Name) and comment.strip().startswith(KINDS):
-                    yield Constant(module, name.id, value, comment.strip())
-    for section, model in SECTIONS.items():
-        for name, field in model.model_fields.items():
-            if type(field.default) in (int, float) and f"{section}.{name}" not in SHOWN:
-                yield Constant(section, name, field.default, field.description or "")
 
 
 def measure(constant: Constant | None, factor: float) -> list[dict[str, Any]]:
@@ -81,10 +33,14 @@ def measure(constant: Constant | None, factor: float) -> list[dict[str, Any]]:
     config = Config().with_values({"scene.objects": "ycb", **values})
     plan = prepare("sceneccn", config, Path("bench") / "constants.json", suite="dev", limit=SCENES)
     records: list[dict[str, Any]] = []
+
+    def hear(_topic: Topic, _part: str | None, message: Message, _payload: bytes | None) -> None:
+        if isinstance(message, Result):
+            records.append(record_of(message))
+
     with _changed(constant, factor):
         pairs = local_pairs("sceneccn", plan.config)
-        run_local(pairs, plan.config.names, RUN, plan.chosen,
-                  lambda topic, part, message, payload: records.append(record_of(message)) if topic == RESULT else None)
+        run_local(pairs, plan.config.names, RUN, plan.chosen, hear)
     return records
 
 

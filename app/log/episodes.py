@@ -108,7 +108,13 @@ class Episode(_Messages):
         self.number, self._steps = number, steps
 
     def __iter__(self) -> Iterator[Step]:
+        """Raises SaccadeError where the log has gone on to the next episode and steps of this one were not read."""
         return self._steps
+
+    def _pass_over(self) -> None:
+        left = sum(1 for _ in self._steps)
+        if left:
+            self._steps = _passed_over(self.number, left)
 
     @property
     def goal(self) -> Goal | None:
@@ -133,7 +139,7 @@ class Episode(_Messages):
 
 class Log:
     """A run's log. Iterating reads the file once, from its start, and gives its episodes in order. An episode has to be
-    read before the next one is asked for; what was not read of it is passed over."""
+    read before the next one is asked for."""
 
     def __init__(self, path: str | Path) -> None:
         """`path`: the folder of a run, or its log. Raises SaccadeError for what is no log."""
@@ -162,8 +168,7 @@ class Log:
             first = next(steps, None)  # with it the goal is known
             episode._steps = _chain(first, steps)
             yield episode
-            for _ in episode._steps:
-                pass
+            episode._pass_over()
 
     def __repr__(self) -> str:
         return f"<Log {self.path}>"
@@ -214,6 +219,12 @@ def _steps(entries: _Entries, episode: Episode) -> Iterator[Step]:
             yield waiting.pop(given)
     for number in sorted(waiting):
         yield waiting[number]
+
+
+def _passed_over(number: int, left: int) -> Iterator[Step]:
+    raise SaccadeError(f"{left} steps of episode {number} were passed over, since a log is read once: read the steps of "
+                       "an episode before you ask for the next one")
+    yield
 
 
 def _chain(first: Step | None, rest: Iterator[Step]) -> Iterator[Step]:

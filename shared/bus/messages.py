@@ -26,14 +26,18 @@ def array(dtype: str, *shape: int | str) -> ArraySpec:
 
 @dataclass(frozen=True, kw_only=True)
 class Message(metaclass=type):  # noqa: UP050 - without it mypy holds that its classes cannot be keys of a cache
-    """What every message carries. `seq` counts the messages of one key and is set by the publisher."""
+    """What every message carries."""
 
     VERSION: ClassVar[int] = 1
 
     run: str
+    """Name of the run."""
     episode: int
+    """Number of the episode within the run, from 0."""
     step: int
+    """Number of the step within the episode, from 0."""
     seq: int = 0
+    """Number of the message among those of its key in this episode, from 0. The publisher sets it."""
 
 
 AnyMessage = TypeVar("AnyMessage", bound=Message)
@@ -41,46 +45,59 @@ AnyMessage = TypeVar("AnyMessage", bound=Message)
 
 @dataclass(frozen=True, kw_only=True)
 class Frame(Message):
-    """What the camera sees. Depth along the optical axis in metres, where the source has it."""
+    """What the camera sees."""
 
     rgb: Annotated[np.ndarray, array("u1", "H", "W", 3)]
-    intrinsics_px: Annotated[np.ndarray, array("f8", 4)]  # fx, fy, cx, cy
+    """The image."""
+    intrinsics_px: Annotated[np.ndarray, array("f8", 4)]
+    """fx, fy, cx, cy in pixels."""
     world_from_camera: Annotated[np.ndarray, array("f8", 4, 4)]
+    """Pose of the camera (OpenGL: it looks along its -z, +y is up; metres)."""
     depth_m: Annotated[np.ndarray, array("f4", "H", "W")] | None = None
+    """Depth along the optical axis, where the source has it."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Goal(Message):
-    """The image to reach; without an image the agent explores."""
+    """The image to reach. Without an image the agent explores."""
 
     rgb: Annotated[np.ndarray, array("u1", "H", "W", 3)] | None
+    """The image."""
     intrinsics_px: Annotated[np.ndarray, array("f8", 4)]
+    """fx, fy, cx, cy in pixels."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Percept(Message):
-    """What one object's network made of one image (paper, section 3.2), on `percept` and `goal_percept`.
-
-    `pixel` is the centre (u, v) of the object; `scale` = 0.40 m / range; the deviations are calibrated.
-    `reconstruction_error`: squared error of the decoded crop where the mask says that the object is seen, summed. The
-    latent pose is seen from the camera. On `goal_percept` the camera's pose is unknown: the identity stands for it.
-    `mask_bits`: whether the object is seen in each of MxM cells of the image, a row of cells packed into bytes.
-    """
+    """What the networks of one object made of one image (paper, section 3.2), on `percept` and `goal_percept`. On
+    `goal_percept` the camera's pose is unknown: the identity stands for it."""
 
     VERSION: ClassVar[int] = 2
 
     object: str
+    """Name of the object."""
     presence: float
+    """Probability that the object is in the image."""
     pixel: Annotated[np.ndarray, array("f8", 2)]
+    """Its centre (u, v)."""
     pixel_std: float
+    """Calibrated standard deviation of the centre, pixels."""
     scale: float
+    """0.40 m divided by its range."""
     log_scale_std: float
+    """Calibrated standard deviation of the scale's logarithm."""
     latent_mean: Annotated[np.ndarray, array("f4", "L")]
+    """Mean of its latent pose, as seen from the camera."""
     latent_std: Annotated[np.ndarray, array("f4", "L")]
+    """Standard deviation of its latent pose."""
     intrinsics_px: Annotated[np.ndarray, array("f8", 4)]
+    """fx, fy, cx, cy of the image, in pixels."""
     world_from_camera: Annotated[np.ndarray, array("f8", 4, 4)]
+    """Pose of the camera."""
     reconstruction_error: float = 0.0
+    """Squared error of the decoded crop, summed over where the mask says that the object is seen."""
     mask_bits: Annotated[np.ndarray, array("u1", "M", "B")] | None = None
+    """Whether the object is seen in each of MxM cells of the image: a row of cells packed into bytes."""
 
     def mask(self) -> np.ndarray | None:
         """Where in the image the object is seen: truth values [M, M]."""
@@ -91,32 +108,39 @@ class Percept(Message):
 
 @dataclass(frozen=True, kw_only=True)
 class Belief(Message):
-    """The posterior over one object: where it is and from where it would look like the goal.
-
-    Position: mean [3] and covariance [3, 3] of the particle cloud (metres, world) and a sample of its particles.
-    Goal view: log posterior [E, A] over the direction (elevation, azimuth; world axes, grid of `viewing_grid`) from
-    which the object looks as in the goal image; absent while there is no goal or the object has not been seen.
-    `presence`: probability that the object is in the scene; `views`: how many views the pose is fused from.
-    `goal_range_m`: range at which the goal image shows it, by the measure of views alike; 0 without a posterior.
-    `goal_here`: probability, by the present view alone, that the goal image was taken from about this direction.
-    `f_*`: the terms of its variational free energy at this step, nats (paper, appendix A).
-    """
+    """The posterior over one object: where it is, and from where it would look like the goal."""
 
     object: str
+    """Name of the object."""
     presence: float
+    """Probability that the object is in the scene."""
     world_from_camera: Annotated[np.ndarray, array("f8", 4, 4)]
+    """Pose of the camera at this step."""
     mean_m: Annotated[np.ndarray, array("f8", 3)]
+    """Mean of the particle cloud (world)."""
     covariance_m2: Annotated[np.ndarray, array("f8", 3, 3)]
+    """Covariance of the particle cloud."""
     particles_m: Annotated[np.ndarray, array("f4", "N", 3)]
+    """A sample of the particles."""
     views: int
+    """How many views the pose is fused from."""
     goal_log_posterior: Annotated[np.ndarray, array("f4", "E", "A")] | None = None
+    """Log posterior over the direction (elevation, azimuth; world axes; grid of `viewing_grid`) from which the
+    object looks as in the goal image. Absent without a goal, or before the object was seen."""
     goal_range_m: float = 0.0
+    """Range at which the goal image shows the object, by the measure of similar views. 0 without a posterior."""
     goal_here: float = 0.0
+    """Probability, by the present view alone, that the goal image was taken from about this direction."""
     f_pose: float = 0.0
+    """Term of the variational free energy (paper, appendix A), nats: the latent pose."""
     f_identity: float = 0.0
+    """The same: the identity."""
     f_crop: float = 0.0
+    """The same: pixel and scale of the crop."""
     f_position: float = 0.0
+    """The same: the position."""
     f_likelihood: float = 0.0
+    """The same: the reconstruction of the crop."""
 
     @property
     def free_energy(self) -> float:
@@ -126,27 +150,38 @@ class Belief(Message):
 
 @dataclass(frozen=True, kw_only=True)
 class Plan(Message):
-    """The chosen viewpoint and the terms of its expected free energy G (paper, equation 5); G is their sum.
-
-    `best_eyes_m`, `best_g`: the best of the candidates it was chosen from, best first, and their G (nats).
-    """
+    """The chosen viewpoint and the terms of its expected free energy G (paper, equation 5). G is their sum."""
 
     VERSION: ClassVar[int] = 2
 
     target: str
+    """The object that the goal image shows; empty while exploring."""
     mode: str
+    """`search`, `approach` or `goal`."""
     viewpoint: Annotated[np.ndarray, array("f8", 4, 4)]
+    """Pose of the camera to move to."""
     look_at_m: Annotated[np.ndarray, array("f8", 3)]
-    g_position: float  # -log P(t | v, goal): look at the goal object
-    g_scale: float  # -log P(sigma | v, goal): at the desired scale
-    g_pose: float  # -log P(p | v, goal): in the desired pose
-    g_information: float  # minus the expected information gain about the positions, nats
+    """Point that the viewpoint looks at."""
+    g_position: float
+    """-log P(t | v, goal): look at the goal object."""
+    g_scale: float
+    """-log P(sigma | v, goal): at the desired scale."""
+    g_pose: float
+    """-log P(p | v, goal): in the desired pose."""
+    g_information: float
+    """Minus the expected information gain about the positions, nats."""
     candidates: int
-    goal_confidence: float  # that the goal image shows the target
-    believed_distance_m: float  # from here to the goal's viewpoint as believed; infinite is not allowed: -1 if unknown
+    """How many candidates it was chosen from."""
+    goal_confidence: float
+    """Probability that the goal image shows the target."""
+    believed_distance_m: float
+    """Distance to the goal's viewpoint as believed, -1 if unknown."""
     arrived: bool
+    """The agent says that it is at the goal's view."""
     best_eyes_m: Annotated[np.ndarray, array("f4", "N", 3)] | None = None
+    """Positions of the best candidates, best first."""
     best_g: Annotated[np.ndarray, array("f4", "N")] | None = None
+    """Their G, nats."""
 
     @property
     def g(self) -> float:
@@ -156,68 +191,96 @@ class Plan(Message):
 
 @dataclass(frozen=True, kw_only=True)
 class Action(Message):
-    """A relative move in world axes: metres, and rotation about the fixed axes x, y, z in radians; |each| <= 0.5.
-
-    `arrived`: the agent says that with this move it is at the goal's view.
-    """
+    """A relative move in world axes. The absolute value of each number is at most 0.5."""
 
     translation_m: Annotated[np.ndarray, array("f8", 3)]
+    """Move of the camera."""
     rotation_rad: Annotated[np.ndarray, array("f8", 3)]
+    """Rotation about the fixed axes x, y and z, in this order."""
     arrived: bool = False
+    """The agent says that with this move it is at the goal's view."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Truth(Message):
-    """The simulator's ground truth, for evaluator, viewer and oracle only. `done`: no further frame will come.
-
-    `keep_out_m`: radii of the spheres around the objects that the camera is pushed out of, in their order. The target's
-    centre is also that of its place in the goal image where it does not stand on the table. `step` counts the actions.
-    """
+    """The simulator's ground truth, for evaluator, viewer and oracle only. `step` counts the actions."""
 
     scene: str
+    """Id of the scene."""
     target: str
+    """Object of the goal."""
     names: list[str]
+    """Objects on the table."""
     centers_m: Annotated[np.ndarray, array("f8", "N", 3)]
+    """Centres of their boxes."""
     yaws_rad: Annotated[np.ndarray, array("f8", "N")]
+    """How they are turned about the vertical axis."""
     keep_out_m: Annotated[np.ndarray, array("f8", "N")]
+    """Radii of the spheres around them that the camera is pushed out of."""
     target_center_m: Annotated[np.ndarray, array("f8", 3)]
+    """Centre of the target, or of its place in the goal image where it does not stand on the table."""
     world_from_camera: Annotated[np.ndarray, array("f8", 4, 4)]
+    """Pose of the camera."""
     goal_world_from_camera: Annotated[np.ndarray, array("f8", 4, 4)]
+    """Pose of the camera that took the goal image."""
     success: bool
+    """The camera is, or was, within the tolerance of the goal's pose."""
     done: bool
-    declared: bool = False  # the agent has said that it had arrived
-    declared_true: bool = False  # and was within tolerance when it first said so
+    """No further frame will come."""
+    declared: bool = False
+    """The agent has said that it had arrived."""
+    declared_true: bool = False
+    """It was within the tolerance when it first said so."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Result(Message):
-    """How an episode ended. Errors are those of the last camera position in spherical coordinates of the target."""
+    """How an episode ended. Errors are those of the last camera position, spherical, around the target."""
 
     scene: str
+    """Id of the scene."""
     target: str
+    """Object of the goal."""
     objects: int
+    """How many objects stood on the table."""
     success: bool
+    """Whether the goal was reached."""
     steps: int
+    """Steps that were taken."""
     azimuth_error_rad: float
+    """Azimuth error."""
     elevation_error_rad: float
+    """Elevation error."""
     range_error_m: float
-    declared: bool  # the agent said that it had arrived
-    declared_true: bool  # and was within tolerance when it first said so
+    """Range error."""
+    declared: bool
+    """The agent said that it had arrived."""
+    declared_true: bool
+    """It was within the tolerance when it first said so."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Status(Message):
-    """A service about itself: its state and what it counted since it started."""
+    """A service about itself: its state, and what it counted since it started."""
 
     service: str
+    """Name of the service."""
     state: str
+    """`starting`, `ready`, `busy`, `finished`, `stopped` or `failed`."""
     received: int = 0
+    """Messages received."""
     published: int = 0
+    """Messages published."""
     refused: int = 0
+    """Messages that were no valid ones."""
     skipped: int = 0
+    """Steps that it could not take."""
     gaps: int = 0
-    milliseconds: float = 0.0  # of the last step
+    """Messages that sequence numbers say are missing."""
+    milliseconds: float = 0.0
+    """Duration of the last step."""
     note: str = ""
+    """What it says in words."""
 
 
 @functools.cache
