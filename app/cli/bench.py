@@ -26,19 +26,19 @@ app = typer.Typer()
 @app.command()
 def bench(*, objects: Objects = None, scenes: ScenesFile = None,
           suite: Annotated[str | None, typer.Option(
-              help="paper-500, yaw-500, lexa-room, dev (for tuning) or paper-like",
+              help="Scenes: paper-500, yaw-500, lexa-room, dev (for tuning) or paper-like.",
               show_default="paper-500 for ycb, paper-like for pantry")] = None,
-          agent: Annotated[str, typer.Option(help="which agent")] = "sceneccn",
-          limit: Annotated[int | None, typer.Option(min=1, help="only so many scenes, evenly chosen")] = None,
-          jobs: Annotated[int, typer.Option(min=1, help="processes at a time")] = 1,
+          agent: Annotated[str, typer.Option(help="Which agent to measure.")] = "sceneccn",
+          limit: Annotated[int | None, typer.Option(min=1, help="Run only so many scenes, chosen evenly.")] = None,
+          jobs: Annotated[int, typer.Option(min=1, help="How many processes work at a time.")] = 1,
           cluster: Annotated[str | None, typer.Option(
-              metavar="ADDRESS", help="a Ray cluster in place of --jobs: ray://host:10001")] = None,
+              metavar="ADDRESS", help="Use a Ray cluster instead of --jobs, such as ray://host:10001.")] = None,
           json: Annotated[Path | None, typer.Option(
-              help="file for the results", show_default="bench/<agent>_<set>[_<suite>].json")] = None,
+              help="File for the results.", show_default="bench/<agent>_<set>[_<suite>].json")] = None,
           yaw: Annotated[Literal["random", "fixed"] | None, typer.Option(
-              help="the suite paper-like, drawn from --seed, its objects turned or not")] = None,
+              help="Draw the suite paper-like from --seed, with its objects turned or not.")] = None,
           seed: Seed = None, weights: WeightsFolder = None, config: ConfigFile = None, values: Values = None) -> None:
-    """Measure an agent on many scenes; given again after an interruption, go on from there."""
+    """Measure an agent on many scenes. The same command continues after an interruption."""
     from rich.console import Console
 
     from saccade.app.bench.bench import bench as run_bench
@@ -57,15 +57,17 @@ def bench(*, objects: Objects = None, scenes: ScenesFile = None,
 
 @app.command()
 def report(*, results: Annotated[list[Path], typer.Argument(
-               metavar="RESULTS.json...", help="files of `saccade bench`")],
-           out: Annotated[Path, typer.Option(help="folder of the report")],
+               metavar="RESULTS.json...", help="Results files of `saccade bench`.")],
+           out: Annotated[Path, typer.Option(help="Folder of the report.")],
            failures: Annotated[bool, typer.Option(
-               "--failures", help="also failures.md: every failed scene, run again, by its cause")] = False,
+               "--failures", help="Also write failures.md: every failed scene is run again and sorted by its "
+                                  "cause.")] = False,
            no_reruns: Annotated[bool, typer.Option(
-               "--no-reruns", help="only what the results alone tell: no episodes are run again")] = False,
+               "--no-reruns", help="Run no episode again, and tell only what the results hold.")] = False,
            weights: WeightsFolder = None,
-           jobs: Annotated[int, typer.Option(min=1, help="processes at a time, for --failures")] = 1) -> None:
-    """Write results as a page with tables and pictures: report.md."""
+           jobs: Annotated[int, typer.Option(
+               min=1, help="How many processes work at a time, for --failures.")] = 1) -> None:
+    """Write results as a page with tables and pictures (report.md)."""
     from rich.console import Console
 
     from saccade.app.bench.report import report as write_report

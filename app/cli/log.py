@@ -11,15 +11,15 @@ from saccade.app.cli.options import wide
 
 EXIT_INCOMPLETE = 1
 
-app = typer.Typer(no_args_is_help=True, help="Look at logs of runs, check, mend, cut and export them.")
+app = typer.Typer(no_args_is_help=True, help="Inspect, check, recover, cut and export the logs of runs.")
 
-Run = Annotated[Path, typer.Argument(metavar="RUN", help="folder of a run, or its log")]
-Out = Annotated[Path, typer.Option(help="the new log, a file")]
+Run = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run, or its log.")]
+Out = Annotated[Path, typer.Option(help="File of the new log.")]
 
 
 @app.command()
 def info(run: Run) -> None:
-    """Say where a log comes from and what is in it: episodes, messages, rates, sizes, gaps."""
+    """Show where a log comes from and what is in it: episodes, messages, rates, sizes and gaps."""
     from rich.console import Console
 
     from saccade.app.log.info import gather, lines
@@ -33,7 +33,7 @@ def info(run: Run) -> None:
 
 @app.command()
 def check(run: Run) -> None:
-    """Say what a log lacks; exit code 0 if that is nothing, else 1."""
+    """Check whether a log is complete. The exit code is 0 if nothing is missing, else 1."""
     from saccade.app.log.check import missing
     from saccade.app.log.source import log_of
 
@@ -47,7 +47,7 @@ def check(run: Run) -> None:
 
 @app.command()
 def recover(run: Run, out: Out) -> None:
-    """Make a good log of a cut or damaged one, and say what was lost."""
+    """Make a good log of a cut or damaged one, and report what was lost."""
     from saccade.app.log.check import missing
     from saccade.app.log.recover import recover as recover_log
     from saccade.app.log.source import log_of
@@ -61,10 +61,10 @@ def recover(run: Run, out: Out) -> None:
 
 @app.command()
 def cut(run: Run, out: Out,
-        episode: Annotated[int | None, typer.Option(min=0, help="which one", show_default="the last")] = None,
-        start: Annotated[int, typer.Option(min=0, help="first step")] = 0,
-        end: Annotated[int | None, typer.Option(min=0, help="last step", show_default="the last")] = None) -> None:
-    """Take some steps of an episode out of a log, as a log of their own."""
+        episode: Annotated[int | None, typer.Option(min=0, help="Episode.", show_default="the last")] = None,
+        start: Annotated[int, typer.Option(min=0, help="First step.")] = 0,
+        end: Annotated[int | None, typer.Option(min=0, help="Last step.", show_default="the last")] = None) -> None:
+    """Copy some steps of an episode into a log of their own."""
     from saccade.app.log.check import missing
     from saccade.app.log.cut import cut as cut_log
     from saccade.app.log.source import log_of
@@ -77,10 +77,10 @@ def cut(run: Run, out: Out,
 
 @app.command()
 def export(run: Run,
-           out: Annotated[Path, typer.Option(help="the new file; with --tables the new folder")],
+           out: Annotated[Path, typer.Option(help="The new file, or the new folder with --tables.")],
            tables: Annotated[bool, typer.Option(
-               "--tables", help="Parquet tables, one for each topic, instead of MCAP")] = False) -> None:
-    """Write a log for other tools: MCAP that Foxglove and Rerun show, or tables."""
+               "--tables", help="Write one Parquet table for each topic instead of MCAP.")] = False) -> None:
+    """Convert a log for other tools: to MCAP that Foxglove and Rerun show, or to tables."""
     from saccade.app.log.export import export_foxglove, export_tables
     from saccade.app.log.source import log_of
 

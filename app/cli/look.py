@@ -13,26 +13,30 @@ from saccade.shared.log.folder import PICTURE_NAME
 
 app = typer.Typer()
 
-RUN = typer.Argument(metavar="RUN", help="folder of a run, or its log")
+RUN = typer.Argument(metavar="RUN", help="Folder of a run, or its log.")
 Log = Annotated[Path, RUN]
 
 
 @app.command()
 def view(*, log: Annotated[Path | None, RUN] = None,
-         live: Annotated[bool, typer.Option("--live", help="a run that goes on, instead of a log")] = False,
+         live: Annotated[bool, typer.Option("--live", help="Show a run that is going on, instead of a log.")] = False,
          save: Annotated[Path | None, typer.Option(
-             help="write a recording for Rerun's own viewer instead", metavar="RUN.rrd")] = None,
+             help="Write a recording for Rerun's own viewer instead of showing it.", metavar="RUN.rrd")] = None,
          truth: Annotated[bool, typer.Option(
-             "--truth", help="also what the simulator alone knows: the goal's camera, objects as ghosts")] = False,
+             "--truth", help="Also show what only the simulator knows: the goal's camera, and the objects as "
+                             "ghosts.")] = False,
          port: Annotated[int | None, typer.Option(
-             min=1, max=65535, help="of the page", show_default="9090 or the next that is free")] = None,
-         open_page: Annotated[bool, typer.Option("--open", help="open it in this machine's browser")] = False,
+             min=1, max=65535, help="Port of the page.", show_default="9090 or the next that is free")] = None,
+         open_page: Annotated[bool, typer.Option("--open", help="Open the page in this machine's browser.")] = False,
          run: Annotated[Path | None, typer.Option(
-             metavar="FOLDER", help="of a run that goes on", show_default="the newest in runs/ that answers")] = None,
-         endpoint: Annotated[str | None, typer.Option(help="a bus instead, e.g. tcp/127.0.0.1:7447")] = None,
+             metavar="FOLDER", help="Folder of the run that is going "
+                                    "on.", show_default="the newest in runs/ that answers")] = None,
+         endpoint: Annotated[str | None, typer.Option(
+             help="Address of a bus instead, such as tcp/127.0.0.1:7447.")] = None,
          weights: Annotated[Path | None, typer.Option(
-             help="that draw crops and views", show_default="the run's own, or weights/pantry")] = None) -> None:
-    """See it think: the table, beliefs, images and curves of a run in a browser; Ctrl-C ends it."""
+             help="Weights of the networks that draw crops and "
+                  "views.", show_default="the run's own, or weights/pantry")] = None) -> None:
+    """Show a run in a browser: the table, beliefs, images, curves and decisions. Ctrl-C ends it."""
     from rich.console import Console
 
     if live == (log is not None):
@@ -43,7 +47,7 @@ def view(*, log: Annotated[Path | None, RUN] = None,
         raise SaccadeError("--run and --endpoint are for a run that goes on: add --live, or leave them out")
     from saccade.app.look.view import view_live, view_log
 
-    if live:
+    if log is None:
         view_live(endpoint=endpoint, run=run, truth=truth, port=port, open_page=open_page, weights=weights,
                   console=Console())
     else:
@@ -52,9 +56,11 @@ def view(*, log: Annotated[Path | None, RUN] = None,
 
 @app.command()
 def picture(log: Log,
-            out: Annotated[Path | None, typer.Option(help="file", show_default="picture.png beside the log")] = None,
-            episode: Annotated[int | None, typer.Option(min=0, help="which", show_default="the last")] = None) -> None:
-    """Draw the picture of a run from its log once more."""
+            out: Annotated[Path | None, typer.Option(
+                help="File of the picture.", show_default="picture.png beside the log")] = None,
+            episode: Annotated[int | None, typer.Option(
+                min=0, help="Episode.", show_default="the last")] = None) -> None:
+    """Draw the picture of a run again, from its log."""
     from saccade.app.log.source import log_of
     from saccade.app.look.picture import draw
 
@@ -65,10 +71,10 @@ def picture(log: Log,
 
 
 @app.command()
-def film(log: Log, out: Annotated[Path, typer.Argument(help="OUT.mp4 or OUT.gif", metavar="OUT")], *,
-         episode: Annotated[int | None, typer.Option(min=0, help="which one", show_default="the last")] = None,
-         rate: Annotated[float, typer.Option(min=0.5, max=60, help="steps a second")] = 5.0) -> None:
-    """Make a short film of an episode from its log: for a paper, a README."""
+def film(log: Log, out: Annotated[Path, typer.Argument(help="File of the film: OUT.mp4 or OUT.gif.", metavar="OUT")], *,
+         episode: Annotated[int | None, typer.Option(min=0, help="Episode.", show_default="the last")] = None,
+         rate: Annotated[float, typer.Option(min=0.5, max=60, help="Steps per second.")] = 5.0) -> None:
+    """Make a short film of an episode from its log."""
     from rich.console import Console
 
     from saccade.app.look.film import film as make_film
@@ -77,24 +83,28 @@ def film(log: Log, out: Annotated[Path, typer.Argument(help="OUT.mp4 or OUT.gif"
     print(f"written to {out}")
 
 
-Key = Annotated[str, typer.Argument(metavar="KEY", help="full key, topic or topic/part; * stands for any")]
-LogFile = Annotated[Path | None, typer.Option(help="a log, or a run's folder, instead of a bus", metavar="RUN")]
-Count = Annotated[int | None, typer.Option(min=1, help="end after so many messages")]
-Endpoint = Annotated[str | None, typer.Option(help="the bus, e.g. tcp/127.0.0.1:7447")]
+Key = Annotated[str, typer.Argument(
+    metavar="KEY", help="Full key, topic, or topic/part. An asterisk stands for anything.")]
+LogFile = Annotated[Path | None, typer.Option(
+    help="Read a log, or the log in a run's folder, instead of a bus.", metavar="RUN")]
+Count = Annotated[int | None, typer.Option(min=1, help="End after so many messages.")]
+Endpoint = Annotated[str | None, typer.Option(help="Address of the bus, such as tcp/127.0.0.1:7447.")]
 OfRun = Annotated[Path | None, typer.Option(
-    metavar="FOLDER", help="of a run that goes on, for its bus", show_default="the newest in runs/ that answers")]
+    metavar="FOLDER", help="Folder of a run that is going on, whose bus is "
+                           "used.", show_default="the newest in runs/ that answers")]
 
 
 @app.command()
 def topics(*, world: Annotated[str | None, typer.Option(
-               help="world, the second part of every key", show_default="the run's, or table")] = None,
+               help="World, which is the second part of every key.", show_default="the run's, or table")] = None,
            log: LogFile = None,
            live: Annotated[bool, typer.Option(
-               "--live", help="of a run that goes on; understood with --endpoint, --run or --seconds")] = False,
+               "--live", help="Show the keys of a run that is going on. Implied by --endpoint, --run and "
+                              "--seconds.")] = False,
            seconds: Annotated[int | None, typer.Option(
-               min=1, max=3600, help="how long to listen", show_default="2")] = None,
+               min=1, max=3600, help="How many seconds to listen.", show_default="2")] = None,
            endpoint: Endpoint = None, run: OfRun = None) -> None:
-    """List what there is on the bus: topics, keys, message types; live or from a log, the keys and how much comes."""
+    """List the topics, keys and message types. For a live run or a log, also show how much comes on each key."""
     from rich.console import Console
 
     from saccade.app.look.topics import topics as list_topics
@@ -104,7 +114,7 @@ def topics(*, world: Annotated[str | None, typer.Option(
 
 @app.command()
 def echo(key: Key, log: LogFile = None, count: Count = None, endpoint: Endpoint = None, run: OfRun = None) -> None:
-    """Print messages, live or from a log; Ctrl-C ends it."""
+    """Print messages, live or from a log. Ctrl-C ends it."""
     from saccade.app.look.echo import echo as print_messages
 
     print_messages(key, log=log, count=count, endpoint=endpoint, run=run)
@@ -112,7 +122,7 @@ def echo(key: Key, log: LogFile = None, count: Count = None, endpoint: Endpoint 
 
 @app.command()
 def hz(key: Key, log: LogFile = None, count: Count = None, endpoint: Endpoint = None, run: OfRun = None) -> None:
-    """Show how often messages come and how evenly, live or from a log; Ctrl-C ends it."""
+    """Show how often and how evenly messages come, live or from a log. Ctrl-C ends it."""
     from saccade.app.look.hz import hz as show_rates
 
     show_rates(key, log=log, count=count, endpoint=endpoint, run=run)

@@ -41,7 +41,7 @@ app.add_typer(log.app, name="log")
 
 @app.command()
 def doctor() -> None:
-    """Check this machine: what works, what is missing, how to mend it."""
+    """Check what works on this machine, what is missing, and how to get it."""
     from saccade.app.doctor import examine
 
     raise typer.Exit(examine())

@@ -11,15 +11,19 @@ import typer
 
 from saccade.shared.errors import SaccadeError
 
-Objects = Annotated[Literal["pantry", "ycb"] | None, typer.Option(help="object set", show_default="pantry")]
-Names = Annotated[str | None, typer.Option(help="only these objects of the set: a,b", metavar="NAMES")]
-ConfigFile = Annotated[Path | None, typer.Option(help="configuration, TOML or JSON; options go before it")]
+Objects = Annotated[Literal["pantry", "ycb"] | None, typer.Option(help="Object set.", show_default="pantry")]
+Names = Annotated[str | None, typer.Option(help="Use only these objects of the set, such as a,b.", metavar="NAMES")]
+ConfigFile = Annotated[Path | None, typer.Option(
+    help="Configuration file, TOML or JSON, or the name of a preset. Options take precedence over it.")]
 Values = Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE",
-                                                  help="configuration by dotted key, e.g. planner.step_m=0.03")]
-WeightsFolder = Annotated[Path | None, typer.Option(help="folder of the weights", show_default="weights/<set>")]
-Seed = Annotated[int | None, typer.Option(min=0, help="seed of everything random", show_default="0")]
-Yaw = Annotated[Literal["random", "fixed"] | None, typer.Option(help="whether drawn objects are turned")]
-ScenesFile = Annotated[Path | None, typer.Option(help="scenes file")]
+                                                  help="Set a key of the configuration, such as planner.step_m=0.03. "
+                                                       "Can be given several times.")]
+WeightsFolder = Annotated[Path | None, typer.Option(
+    help="Folder of the trained weights.", show_default="weights/<set>")]
+Seed = Annotated[int | None, typer.Option(min=0, help="Seed of everything random.", show_default="0")]
+Yaw = Annotated[Literal["random", "fixed"] | None, typer.Option(
+    help="Whether drawn objects are turned about the vertical axis.")]
+ScenesFile = Annotated[Path | None, typer.Option(help="Scenes file (JSON).")]
 
 
 def configured(path: Path | None, given: dict[str, Any], values: list[str] | None) -> Any:

@@ -13,25 +13,30 @@ app = typer.Typer()
 
 
 @app.command()
-def replay(logs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="folders of runs, or their logs")], *,
-           into: Annotated[str, typer.Option(metavar="NAMES", help="services: perception,belief,planner,evaluator")],
-           check: Annotated[bool, typer.Option("--check", help="exit code 1 if anything is not as recorded")] = False,
+def replay(logs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Folders of runs, or their logs.")], *,
+           into: Annotated[str, typer.Option(
+               metavar="NAMES", help="Services that the recorded inputs are played to: "
+                                     "perception,belief,planner,evaluator.")],
+           check: Annotated[bool, typer.Option(
+               "--check", help="End with exit code 1 if anything differs from the recording.")] = False,
            bus: Annotated[Literal["zenoh", "local"], typer.Option(
-               help="services as processes on Zenoh, or all within this one")] = "zenoh",
-           rate: Annotated[str, typer.Option(help="times as fast as recorded, 0.1 to 100, or max")] = "max",
-           start: Annotated[str | None, typer.Option(help="first step, or a time such as 2.5s")] = None,
-           end: Annotated[str | None, typer.Option(help="last step, or a time such as 9s")] = None,
-           episode: Annotated[int | None, typer.Option(min=0, help="only this one")] = None,
-           topics: Annotated[str | None, typer.Option(metavar="NAMES", help="only these of the inputs")] = None,
-           loop: Annotated[int, typer.Option(min=1, help="so many times")] = 1,
-           step: Annotated[bool, typer.Option("--step", help="one message for each key press")] = False,
+               help="Run each service as a process on a Zenoh bus, or all within this process.")] = "zenoh",
+           rate: Annotated[str, typer.Option(help="Speed relative to the recording, from 0.1 to 100, or max.")] = "max",
+           start: Annotated[str | None, typer.Option(help="First step, or a time such as 2.5s.")] = None,
+           end: Annotated[str | None, typer.Option(help="Last step, or a time such as 9s.")] = None,
+           episode: Annotated[int | None, typer.Option(min=0, help="Play only this episode.")] = None,
+           topics: Annotated[str | None, typer.Option(metavar="NAMES", help="Play only these of the inputs.")] = None,
+           loop: Annotated[int, typer.Option(min=1, help="How many times the log is played.")] = 1,
+           step: Annotated[bool, typer.Option("--step", help="Play one message for each key press.")] = False,
            perception: Annotated[Path | None, typer.Option(
-               help="other weights: a folder, or its name in weights/; tells what moved")] = None,
-           out: Annotated[Path | None, typer.Option(help="folder of the replay", show_default="replays/<time>")] = None,
+               help="Use other weights: a folder, or its name in weights/. A table and a picture then show how far "
+                    "everything moved.")] = None,
+           out: Annotated[Path | None, typer.Option(
+               help="New folder of the replay.", show_default="replays/<time>")] = None,
            values: Values = None) -> None:
-    """Play recorded inputs into services as they are now, log what they say, compare it with the recording.
+    """Play recorded inputs into the services as they are now, and compare what they say with the recording.
 
-    Space pauses and goes on, q ends.
+    The space bar pauses and continues, q ends the replay.
     """
     from rich.console import Console
 

@@ -28,27 +28,36 @@ app = typer.Typer()
 
 @app.command()
 def run(*, objects: Objects = None, names: Names = None, scenes: ScenesFile = None,
-        scene: Annotated[str | None, typer.Option(help="id of one scene in the file")] = None, seed: Seed = None,
-        count: Annotated[int | None, typer.Option(min=1, help="how many scenes to draw")] = None,
-        n_objects: Annotated[int | None, typer.Option(min=1, help="objects on the table")] = None, yaw: Yaw = None,
-        goal: Annotated[Path | None, typer.Option(help="goal image, 480x480 PNG or JPEG")] = None,
-        explore: Annotated[bool, typer.Option("--explore", help="no goal: find out what is there")] = False,
-        out: Annotated[Path | None, typer.Option(help="folder of the run", show_default="runs/<time>-<seed>")] = None,
+        scene: Annotated[str | None, typer.Option(
+            help="Run only the scene with this id in the file.")] = None, seed: Seed = None,
+        count: Annotated[int | None, typer.Option(min=1, help="How many scenes are drawn.")] = None,
+        n_objects: Annotated[int | None, typer.Option(
+            min=1, help="How many objects stand on the table.")] = None, yaw: Yaw = None,
+        goal: Annotated[Path | None, typer.Option(
+            help="Image of the view to find: PNG or JPEG, 480x480 pixels.")] = None,
+        explore: Annotated[bool, typer.Option(
+            "--explore", help="Explore without a goal: find out what is on the table.")] = False,
+        out: Annotated[Path | None, typer.Option(
+            help="New folder of the run.", show_default="runs/<time>-<seed>")] = None,
         bus: Annotated[Literal["zenoh", "local"] | None, typer.Option(
-            help="services as processes on Zenoh, or all within this one", show_default="zenoh")] = None,
-        agent: Annotated[str, typer.Option(help="which agent")] = "sceneccn", weights: WeightsFolder = None,
-        world: Annotated[str, typer.Option(help="simulator, or camera: a real one")] = "simulator",
+            help="Run each service as a process on a Zenoh bus, or all within this "
+                 "process.", show_default="zenoh")] = None,
+        agent: Annotated[str, typer.Option(help="Which agent to run.")] = "sceneccn", weights: WeightsFolder = None,
+        world: Annotated[str, typer.Option(
+            help="Where images come from: simulator, or camera for a real one.")] = "simulator",
         source: Annotated[str | None, typer.Option(
-            help="of a camera's images: a folder, a video file, or a webcam: webcam:0")] = None,
-        poses: Annotated[Path | None, typer.Option(help="where the camera was: JSON lines or TUM")] = None,
-        intrinsics: Annotated[str | None, typer.Option(help="of its images, in pixels", metavar="fx,fy,cx,cy")] = None,
+            help="Images of a real camera: a folder, a video file, or a webcam (webcam:0).")] = None,
+        poses: Annotated[Path | None, typer.Option(help="File with the camera's poses: JSON lines or TUM.")] = None,
+        intrinsics: Annotated[str | None, typer.Option(
+            help="Intrinsics of the camera's images, in pixels.", metavar="fx,fy,cx,cy")] = None,
         rate: Annotated[float | None, typer.Option(
-            help="images a second of a folder or webcam", show_default="10")] = None,
-        loop: Annotated[bool, typer.Option("--loop", help="from the first image again after the last")] = False,
+            help="Images per second, of a folder or a webcam.", show_default="10")] = None,
+        loop: Annotated[bool, typer.Option("--loop", help="Begin again with the first image after the last.")] = False,
         config: ConfigFile = None, values: Values = None,
-        view: Annotated[bool, typer.Option("--view", help="show it in a browser, see `saccade view`")] = False,
-        plain: Annotated[bool, typer.Option("--plain", help="lines instead of the live display")] = False) -> None:
-    """Run the agent and log everything: run.mcap, config.json, picture.png."""
+        view: Annotated[bool, typer.Option("--view", help="Show the run in a browser while it goes on.")] = False,
+        plain: Annotated[bool, typer.Option(
+            "--plain", help="Print lines instead of the live display.")] = False) -> None:
+    """Run the agent. The run's folder gets run.mcap (every message), config.json and picture.png."""
     from rich.console import Console
 
     from saccade.app.look.picture import draw_run

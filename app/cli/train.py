@@ -15,17 +15,23 @@ app = typer.Typer()
 @app.command()
 def train(*, objects: Objects = None, names: Names = None,
           out: Annotated[Path | None, typer.Option(
-              help="folder of the training", show_default="training_runs/<set>")] = None,
-          steps_ccn: Annotated[int | None, typer.Option(min=1, help="steps of each object's networks")] = None,
-          steps_extraction: Annotated[int | None, typer.Option(min=1, help="steps of the network for all")] = None,
-          views: Annotated[int | None, typer.Option(min=20, max=5000, help="views of each object")] = None,
-          seed: Seed = None, jobs: Annotated[int, typer.Option(min=1, help="networks at a time")] = 1,
+              help="Folder of the training run.", show_default="training_runs/<set>")] = None,
+          steps_ccn: Annotated[int | None, typer.Option(
+              min=1, help="Training steps of each object's networks.")] = None,
+          steps_extraction: Annotated[int | None, typer.Option(
+              min=1, help="Training steps of the extraction network.")] = None,
+          views: Annotated[int | None, typer.Option(
+              min=20, max=5000, help="How many views of each object are rendered.")] = None,
+          seed: Seed = None, jobs: Annotated[int, typer.Option(
+              min=1, help="How many networks are trained at a time.")] = 1,
           device: Annotated[Literal["auto", "cpu", "cuda"] | None, typer.Option(show_default="auto")] = None,
           architecture: Annotated[Literal["default", "paper"], typer.Option(
-              help="our networks, or those of the paper's tables; theirs go to folders named <set>-paper")] = "default",
+              help="Saccade's networks, or those of the paper's tables. The paper's go to folders named "
+                   "<set>-paper.")] = "default",
           weights: WeightsFolder = None, values: Annotated[list[str] | None, typer.Option(
-              "--set", metavar="KEY=VALUE", help="any key of training/settings.py, e.g. batch_ccn=64")] = None) -> None:
-    """Train the networks of an object set; given again after an interruption, go on from there."""
+              "--set", metavar="KEY=VALUE", help="Set a training setting, such as batch_ccn=64 (see "
+                                                 "training/settings.py).")] = None) -> None:
+    """Train the networks of an object set. The same command continues after an interruption."""
     from rich.console import Console
 
     from saccade.services.simulator.objects import names_in_use
