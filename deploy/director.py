@@ -25,7 +25,7 @@ from rich.console import Console
 
 from saccade.app.cli.options import configured, numbers
 from saccade.app.run.display import LINE_EVERY, Progress, line, say
-from saccade.app.run.launch import Graph, follow, messages, resolve
+from saccade.app.run.launch import follow, messages, resolve
 from saccade.app.run.registry import DEFAULT_WORLD, WORLDS, agent_processes, world_of
 from saccade.app.run.summary import summary
 from saccade.app.run.supervisor import HUNG_S, Process
@@ -136,8 +136,8 @@ def _follow(folder: Path, processes: Sequence[Process], console: Console, worlds
     with closing(ZenohBus(config.bus.endpoint, world=config.bus.world, timeout_s=ROUTER_S)) as bus:
         bus.subscribe((view, *SHOWN), lambda *item: arrived.put(item))
         elsewhere = Elsewhere([process.name for process in processes[1:]], tell)  # the router is the first world's
-        graph = Graph(bus, elsewhere, messages(arrived, bus, elsewhere, config.run))
-        results = follow(graph, processes, on_message)
+        told = messages(arrived, bus, elsewhere, config.run or folder.name)
+        results = follow(told, elsewhere, processes, on_message)
     for text in summary(config, results, progress):
         tell(text)
     tell(f"log: {Path(runs_folder().name) / folder.relative_to(runs_folder()) / LOG_NAME}")

@@ -29,7 +29,7 @@ def main(endpoint: str, count: int) -> None:
     config = zenoh.Config()
     for key, value in {"mode": "client", "connect/endpoints": [endpoint], "scouting/multicast/enabled": False}.items():
         config.insert_json5(key, json.dumps(value))
-    arrived = queue.Queue(maxsize=100)
+    arrived: queue.Queue[tuple[str, bytes]] = queue.Queue(maxsize=100)
     with zenoh.open(config) as session:
         for topic in ("frame", "belief/*"):
             session.declare_subscriber(f"saccade/*/{topic}", lambda s: arrived.put((str(s.key_expr), bytes(s.payload))))

@@ -229,7 +229,7 @@ class Config(Section):
         """A copy with dotted keys replaced (`{"scene.yaw": "fixed"}`). Raises SaccadeError for an unknown key."""
         tree = self.model_dump(mode="json")
         for dotted, value in values.items():
-            node = tree
+            node: Any = tree
             *parents, last = dotted.split(".")
             for parent in parents:
                 node = node.get(parent) if isinstance(node, dict) else None

@@ -20,7 +20,7 @@ from saccade.services.recorder.core import describe
 from saccade.services.replayer.core import Keys, Pace, Selection, play
 from saccade.shared.bus.messages import Message, Status
 from saccade.shared.bus.outbox import Outbox
-from saccade.shared.bus.topics import STATUS, TOPICS, Output, Topic
+from saccade.shared.bus.topics import TOPICS, Output, Topic
 from saccade.shared.bus.transport import free_endpoint
 from saccade.shared.bus.wire import MessageError, Stamp, decode, encode, stamp_of
 from saccade.shared.config import Config, validate
@@ -163,7 +163,7 @@ def new_log(out: Path, config: Config) -> RunLog:
     """The log of a replay, in a new folder with the configuration beside it."""
     out.mkdir(parents=True, exist_ok=True)
     log = RunLog(out / LOG_NAME, world=config.bus.world, configuration=config.model_dump_json(indent=2),
-                 metadata=describe(config, config.run))
+                 metadata=describe(config, config.run or out.name))
     config.save(out / CONFIG_NAME)
     return log
 
@@ -245,7 +245,7 @@ class _Playing:
         for item in self._graph.messages:
             if item is not None and self._take(*item):
                 news_s = time.monotonic()
-            if waiting and item is not None and item[0] == STATUS and item[2].state in READY_STATES:
+            if waiting and item and item[1] and isinstance(item[2], Status) and item[2].state in READY_STATES:
                 waiting.discard(item[1])
                 if not waiting:
                     thread.start()
@@ -265,7 +265,7 @@ class _Playing:
 
     def _take(self, topic: Topic, part: str | None, message: Message) -> bool:
         """Notes a message; whether it was an answer."""
-        if topic == STATUS:
+        if isinstance(message, Status) and part is not None:
             self.outcome.statuses[part] = message
             return False
         if topic not in self._replay.outputs.topics:

@@ -76,9 +76,9 @@ def _topic(name: str) -> Topic:
 
 def _weights(perception: Path | None) -> dict[str, str]:
     """The configuration of other perception weights: a folder, or the name of one in weights/."""
-    if perception is None:
-        return {}
     folder = weights_folder(perception)
+    if folder is None:
+        return {}
     manifest = folder / "manifest.json"
     if not manifest.is_file():
         raise SaccadeError(f"--perception {perception}: {manifest} is not there: give a folder with weights")

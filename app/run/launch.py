@@ -11,10 +11,11 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 from saccade.app.run.supervisor import Process, Supervisor
 from saccade.services.simulator.objects import names_of
-from saccade.shared.bus.messages import Message, Result
+from saccade.shared.bus.messages import Message, Result, Status
 from saccade.shared.bus.sequences import Sequences
 from saccade.shared.bus.topics import PLAN, RESULT, STATUS, Topic
 from saccade.shared.bus.transport import Bus, ZenohBus, free_endpoint
@@ -23,7 +24,9 @@ from saccade.shared.config import Config
 from saccade.shared.errors import SaccadeError
 from saccade.shared.log.folder import CONFIG_NAME, LOG_NAME, LOGS_NAME
 from saccade.shared.loop.main import READY_STATES
+from saccade.shared.loop.process import Item
 
+Told = tuple[Topic, str | None, Message]
 OnMessage = Callable[[Topic, str | None, Message], None]
 FOLLOWED = (STATUS, PLAN, RESULT)  # by which the launcher knows how far a run is
 READY_S = 120.0  # loading weights on a busy machine takes its time
@@ -69,12 +72,27 @@ def launched(config: Config, run_dir: Path, on_message: OnMessage | None = None,
     config = resolve(config, processes)
     wanted = topics if on_message else ()
     with running(config, run_dir, processes, wanted if wanted is None else {*wanted, *FOLLOWED}, say) as graph:
-        results = follow(graph, processes, on_message)
+        results = follow(graph.messages, graph.supervisor, processes, on_message)
         graph.supervisor.stop(onlookers=False)
         _drain(graph.messages, on_message)
         for complaint in graph.supervisor.complaints():  # what went wrong beside the results, such as a full disk
             print(f"saccade: {complaint}", file=sys.stderr)
         yield Ended(results, graph.supervisor.runs)
+
+
+class Watch(Protocol):
+    """Who knows how the services of a run are: their supervisor, or one that only hears them."""
+
+    stopped: bool
+
+    def heard(self, name: str, state: str) -> None:
+        """A heartbeat has come."""
+
+    def check(self) -> None:
+        """To be called a few times a second."""
+
+    def settled(self, since_s: float) -> bool:
+        """Whether all services were heard since that time."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +102,7 @@ class Graph:
 
     bus: Bus
     supervisor: Supervisor
-    messages: Iterator[tuple[Topic, str | None, Message] | None]
+    messages: Iterator[Told | None]
 
 
 @contextmanager
@@ -94,7 +112,7 @@ def running(config: Config, run_dir: Path, processes: Sequence[Process], topics:
     router, and is there before the others. `topics`: which messages are wanted, None for all."""
     _prepare(run_dir)
     config.save(run_dir / CONFIG_NAME)
-    arrived: queue.SimpleQueue = queue.SimpleQueue()
+    arrived: queue.SimpleQueue[Item] = queue.SimpleQueue()
     with ExitStack() as stack:
         stack.enter_context(_terminable())
         supervisor = Supervisor(run_dir, say or (lambda text: print(f"saccade: {text}", file=sys.stderr)))
@@ -126,48 +144,49 @@ def _prepare(run_dir: Path) -> None:
         raise SaccadeError(f"run folder {run_dir} cannot be made: {error.strerror}") from error
 
 
-def messages(arrived: queue.SimpleQueue, bus: Bus, supervisor: Supervisor, run: str) -> Iterator:
+def messages(arrived: queue.SimpleQueue[Item], bus: Bus, watch: Watch, run: str) -> Iterator[Told | None]:
     """(topic, part, message) as they arrive, each once, and None when nothing did."""
     sequences, looked_s, news_s = Sequences(), time.monotonic(), time.monotonic()
     while True:
         now_s = time.monotonic()
         if now_s - looked_s >= POLL_S:
             looked_s = now_s
-            supervisor.check()
-        if now_s - news_s >= QUIET_S and not supervisor.stopped:
+            watch.check()
+        if now_s - news_s >= QUIET_S and not watch.stopped:
             news_s = now_s
             for topic, part, payload, *_ in bus.recall((RESULT,), (run, 0, 0)):
                 arrived.put((topic, part, payload))
-        item = None
+        item: Told | None = None
         with suppress(queue.Empty, MessageError):  # whoever subscribes to an invalid message counts it
             topic, part, payload = arrived.get(timeout=POLL_S)
             message = decode(topic.type, payload)
-            if topic == STATUS:
-                supervisor.heard(part, message.state)
+            if isinstance(message, Status) and part is not None:
+                watch.heard(part, message.state)
             if sequences.take(topic, part, message) is not None:
                 item = (topic, part, message)
                 news_s = news_s if topic == STATUS else now_s
         yield item
 
 
-def _await_router(messages: Iterator, router: Process) -> None:
+def _await_router(messages: Iterator[Told | None], router: Process) -> None:
     deadline_s = time.monotonic() + READY_S
     for item in messages:
-        if item is not None and item[0] == STATUS and item[1] == router.name and item[2].state in READY_STATES:
+        if item and item[1] == router.name and isinstance(item[2], Status) and item[2].state in READY_STATES:
             return
         if time.monotonic() > deadline_s:
             raise SaccadeError(f"{router.name}: not ready after {READY_S:.0f} s; see {LOGS_NAME}/")
 
 
-def follow(graph: Graph, processes: Sequence[Process], on_message: OnMessage | None) -> list[Result]:
+def follow(told: Iterable[Told | None], watch: Watch, processes: Sequence[Process],
+           on_message: OnMessage | None) -> list[Result]:
     starting = {process.name for process in processes[1:] if not process.onlooker}
     course = _Course(processes[1].name, judged=JUDGE in starting)
     over_s, deadline_s = None, time.monotonic() + READY_S
-    for item in graph.messages:
+    for item in told:
         if starting and time.monotonic() > deadline_s:
             raise SaccadeError(f"{', '.join(sorted(starting))}: not ready after {READY_S:.0f} s; see {LOGS_NAME}/")
         over_s = (over_s or time.monotonic()) if course.over else None
-        if over_s is not None and graph.supervisor.settled(over_s):
+        if over_s is not None and watch.settled(over_s):
             break
         if item is None:
             continue
@@ -175,7 +194,7 @@ def follow(graph: Graph, processes: Sequence[Process], on_message: OnMessage | N
         if on_message is not None:
             on_message(topic, part, message)
         course.take(topic, part, message)
-        if topic == STATUS and message.state in READY_STATES:
+        if isinstance(message, Status) and part is not None and message.state in READY_STATES:
             starting.discard(part)
     return [course.results[episode] for episode in sorted(course.results)]
 
@@ -193,11 +212,11 @@ class _Course:
         """Any message."""
         if topic.in_step:
             self._news_s = time.monotonic()
-        if topic == RESULT:
+        if isinstance(message, Result):
             self.results[message.episode] = message
         elif topic == PLAN:
             self._planned = max(self._planned, (message.episode, message.step))
-        elif topic == STATUS and part == self._source and message.state == "finished":
+        elif isinstance(message, Status) and part == self._source and message.state == "finished":
             self._end = (message.episode, message.step)
 
     @property
@@ -211,7 +230,7 @@ class _Course:
         return self._planned >= self._end or time.monotonic() - self._news_s > WORKED_OFF_S
 
 
-def _drain(messages: Iterator, on_message: OnMessage | None) -> None:
+def _drain(messages: Iterator[Told | None], on_message: OnMessage | None) -> None:
     """What was still on its way when the services were stopped."""
     while on_message is not None and (item := next(messages)) is not None:
         on_message(*item)

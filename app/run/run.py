@@ -140,6 +140,7 @@ def run_here(config: Config, agent: str, folder: Path, display: Display, world: 
 
     def on_message(topic: Topic, part: str | None, message: Message, payload: bytes | None) -> None:
         end_if_interrupted()
+        assert payload is not None  # since all is encoded
         try:
             log.write(topic, part, payload, sequence=message.seq)
         except RecordingStopped as error:  # once; what follows is not logged
@@ -149,7 +150,7 @@ def run_here(config: Config, agent: str, folder: Path, display: Display, world: 
     display.note("\n".join(getattr(source, "notes", ())))
     with _interrupted_between_messages() as end_if_interrupted:
         try:
-            run_local(pairs, config.scene.names, folder.name, on_message=on_message, encoded=True)
+            run_local(pairs, config.names, folder.name, on_message=on_message, encoded=True)
         finally:
             log.close()
             if left_out := getattr(source, "skipped", 0):

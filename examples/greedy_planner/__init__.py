@@ -3,6 +3,8 @@
 PYTHONPATH=examples saccade run --explore --set services.planner=greedy_planner
 """
 
+from typing import Any
+
 import numpy as np
 
 from saccade.services.planner.motion import step_towards
@@ -30,7 +32,7 @@ class GreedyPlanner:
         camera = vague.world_from_camera
         viewpoint = look_at(vague.mean_m + RANGE_M * unit(camera[:3, 3] - vague.mean_m), vague.mean_m)
         translation, rotation = step_towards(camera, viewpoint, NOTHING_IN_THE_WAY, self.step_m)
-        stamp = {"run": vague.run, "episode": vague.episode, "step": vague.step}
+        stamp: dict[str, Any] = {"run": vague.run, "episode": vague.episode, "step": vague.step}
         yield Output(PLAN, Plan(**stamp, target="", mode="search", viewpoint=viewpoint, look_at_m=vague.mean_m,
                                 g_position=0.0, g_scale=0.0, g_pose=0.0, g_information=0.0, candidates=1,
                                 goal_confidence=0.0, believed_distance_m=-1.0, arrived=False))

@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 from saccade.shared.bus.messages import Message
@@ -108,9 +109,9 @@ class _Loop:
         self.notes = "\n".join(getattr(core, "notes", ()))
         self._ticker = Ticker(core.period_s) if stepper.timed else None
         self._live, self._sequences = live, Sequences()
-        self._share = Share(service, stepper.parts) if service.divisible and not live else None
-        if self._share:
-            stepper.is_due = lambda at: self._share.lacks(core.names, at)
+        share = self._share = Share(service, stepper.parts) if service.divisible and not live else None
+        if share:
+            stepper.is_due = lambda at: share.lacks(core.names, at)
         self._next_episode, self._closed = 0, -1
         self._refused: set[Topic] = set()
         self._end = core.episodes if self._source else 0
@@ -129,7 +130,7 @@ class _Loop:
         """Meets the replicas of this service, if it is one that can be shared. A source must be alone: raises
         SaccadeError where another one is there."""
         if self._share:
-            self._bus.join(self._service.name, self._share.me, lambda members: (self._share.met(members), inbox.wake()))
+            self._share.meet(self._bus, inbox.wake)
             inbox.stopping.wait(MEET_S)
             if self._share.changed:
                 inbox.stopping.wait(JOIN_S)
@@ -170,7 +171,7 @@ class _Loop:
         """Keeps what another replica said: should that one die, this one can still be asked for it. What is no message
         is no answer."""
         with suppress(MessageError):
-            if not self._share.is_answered(topic, part, stamp_of(payload)):
+            if self._share and not self._share.is_answered(topic, part, stamp_of(payload)):
                 message = decode(topic.type, payload)
                 self._share.answered(topic, part, message)
                 self.outbox.keep(topic, part, message, payload)
@@ -197,7 +198,7 @@ class _Loop:
                 self.health.say("finished")
                 return
             episode, self._next_episode = self._next_episode, self._next_episode + 1
-            self._step(None, None, lambda e=episode: self._stepper.begin(self._run, e))
+            self._step(None, None, partial(self._stepper.begin, self._run, episode))
             if self._ticker:
                 self._ticker.start()
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import time
 import uuid
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 from saccade.shared.bus.messages import Message
 from saccade.shared.bus.sequences import Episode, Key
@@ -67,6 +67,14 @@ class Share:
     def met(self, members: frozenset[str]) -> None:
         """Who is there now, maybe without this one yet; from the bus's thread."""
         self._known = members | {self.me}
+
+    def meet(self, bus: Bus, wake: Callable[[], None]) -> None:
+        """Says on the bus that this one is there; calls `wake`, from the bus's thread, when another comes or goes."""
+        def met(members: frozenset[str]) -> None:
+            self.met(members)
+            wake()
+
+        bus.join(self._service.name, self.me, met)
 
     @property
     def changed(self) -> bool:

@@ -37,14 +37,24 @@ class Core(Protocol):
         """All inputs of one step."""
 
 
+class Source(Core, Protocol):
+    """A core that begins episodes by itself."""
+
+    @property
+    def episodes(self) -> int:
+        """How many."""
+
+
 class DivisibleCore(Core, Protocol):
     """A core that answers for some of the objects."""
+
+    names: tuple[str, ...]  # for these, now
 
     def share(self, names: tuple[str, ...]) -> None:
         """From now on for these, maybe none."""
 
 
-class TimedSource(Core, Protocol):
+class TimedSource(Source, Protocol):
     """A source that goes by time, not by actions: its episode ends when there is no next frame."""
 
     period_s: float  # from one frame to the next

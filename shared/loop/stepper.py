@@ -38,7 +38,8 @@ class Stepper:
                  live: bool = False, first_step: int = 0) -> None:
         if service.trigger not in service.inputs:
             raise SaccadeError(f"service {service.name}: its trigger {service.trigger.name} is not among its inputs")
-        self.service, self.core, self.parts = service, core, parts
+        self.service, self.parts = service, parts
+        self.core: Any = core  # what it has beside a Core's methods depends on its kind
         self.skipped = 0  # steps that never became complete
         self.episode_done = source  # a source is between episodes
         self.at: tuple[str, int, int] = ("", 0, 0)  # run, episode, step last begun or stepped
