@@ -2,7 +2,7 @@
 PYTHON ?= python3
 SACCADE = .venv/bin/saccade
 
-.PHONY: run up test test-compose test-package lint bench fixtures clean
+.PHONY: run up test test-compose test-package lint docs bench fixtures clean
 
 run: .venv/.installed
 	$(SACCADE) run --view
@@ -28,6 +28,11 @@ lint: .venv/.installed-dev
 # Builds a wheel, installs it into an empty environment and uses it there.
 test-package: .venv/.installed-dev
 	.venv/bin/python -m pytest -q tests/package
+
+# Writes the reference pages anew and builds the guide into site/.
+docs: .venv/.installed-dev
+	.venv/bin/python -m saccade.app.reference docs
+	.venv/bin/mkdocs build --strict
 
 fixtures: .venv/.installed-dev
 	.venv/bin/python -m saccade.tests.fixtures.make
