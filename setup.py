@@ -30,7 +30,9 @@ class BuildWithCommit(build_py):
             shutil.rmtree(self.build_lib, ignore_errors=True)  # or modules that are gone would be packed
         super().run()
         if not self.editable_mode:
-            Path(self.build_lib, "saccade", COMMIT).write_text(commit() + "\n")
+            target = Path(self.build_lib, "saccade", COMMIT)
+            target.parent.mkdir(parents=True, exist_ok=True)  # an image installs the dependencies before there is code
+            target.write_text(commit() + "\n")
 
     def find_package_modules(self, package: str, package_dir: str) -> list[tuple[str, str, str]]:
         return [module for module in super().find_package_modules(package, package_dir) if module[1] != "setup"]

@@ -1,4 +1,4 @@
-"""Reads frames and beliefs off the bus of a run, with nothing of Saccade's: any language with Zenoh and MessagePack can.
+"""Reads frames and beliefs off the bus of a run, without Saccade: any language with Zenoh and MessagePack can do it.
 
     pip install eclipse-zenoh msgpack numpy
     python examples/listen.py tcp/127.0.0.1:PORT [COUNT]

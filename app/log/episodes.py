@@ -222,8 +222,8 @@ def _steps(entries: _Entries, episode: Episode) -> Iterator[Step]:
 
 
 def _passed_over(number: int, left: int) -> Iterator[Step]:
-    raise SaccadeError(f"{left} steps of episode {number} were passed over, since a log is read once: read the steps of "
-                       "an episode before you ask for the next one")
+    raise SaccadeError(f"{left} steps of episode {number} were passed over, since a log is read once: read the steps "
+                       "of an episode before you ask for the next one")
     yield
 
 
