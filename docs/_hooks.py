@@ -4,10 +4,11 @@ In a checkout the package is the root of the repository. There mkdocstrings woul
 """
 
 import tempfile
-from importlib.util import find_spec
 from pathlib import Path
 
 from mkdocs.plugins import event_priority
+
+import saccade
 
 ROOMS = ("__init__.py", "app", "services", "shared")
 
@@ -17,12 +18,11 @@ _names = tempfile.TemporaryDirectory(prefix="saccade-guide-")  # removed when Mk
 @event_priority(100)
 def on_config(config):
     """Before mkdocstrings looks for the package."""
-    spec = find_spec("saccade")
     package = Path(_names.name, "saccade")
     package.mkdir(exist_ok=True)
     for room in ROOMS:
         link = package / room
         if not link.is_symlink():
-            link.symlink_to(Path(spec.submodule_search_locations[0], room))
+            link.symlink_to(Path(saccade.__file__).parent / room)
     config.plugins["mkdocstrings"].config.handlers["python"]["paths"] = [_names.name]
     return config
