@@ -23,7 +23,7 @@ from typing import Any
 
 from rich.console import Console
 
-from saccade.app.cli.options import configured, numbers
+from saccade.app.cli.texts import configured, numbers
 from saccade.app.run.display import LINE_EVERY, Progress, line, say
 from saccade.app.run.launch import follow, messages, resolve
 from saccade.app.run.registry import DEFAULT_WORLD, WORLDS, agent_processes, world_of

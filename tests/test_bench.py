@@ -135,7 +135,7 @@ def test_registry_and_launcher_agree():
     with pytest.raises(SaccadeError, match="unknown: choose from"):
         agent_pairs("nobody", Config())
     for agent in AGENTS.values():
-        assert agent.modules
+        assert agent.services or agent.cores
 
 
 # --- the runs

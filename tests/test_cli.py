@@ -18,7 +18,7 @@ import typer
 from rich.console import Console
 
 import saccade.app.cli.main as cli
-from saccade.app.cli import options
+from saccade.app.cli import texts
 from saccade.app.doctor import Check, Finding, examine
 from saccade.app.log.check import missing
 from saccade.app.run.display import Progress, line, panel
@@ -153,11 +153,11 @@ def test_unknown_options_are_refused(monkeypatch, capsys):
 def test_options_go_before_the_file_and_set_before_all(tmp_path):
     """file < option < --set; a value that is not JSON is text."""
     (tmp_path / "c.toml").write_text('seed = 1\n[scene]\nobjects = "ycb"\nyaw = "fixed"\n[planner]\nstep_m = 0.01\n')
-    config = options.configured(tmp_path / "c.toml", {"seed": 2, "scene.objects": None}, ["planner.step_m=0.03"])
+    config = texts.configured(tmp_path / "c.toml", {"seed": 2, "scene.objects": None}, ["planner.step_m=0.03"])
     assert (config.seed, config.scene.objects, config.scene.yaw, config.planner.step_m) == (2, "ycb", "fixed", 0.03)
-    assert options.parse_value('scene.names=["a"]') == ("scene.names", ["a"])
-    assert options.parse_value("bus.world=a=b") == ("bus.world", "a=b")
-    assert options.split_names("a, b,") == ["a", "b"]
+    assert texts.parse_value('scene.names=["a"]') == ("scene.names", ["a"])
+    assert texts.parse_value("bus.world=a=b") == ("bus.world", "a=b")
+    assert texts.split_names("a, b,") == ["a", "b"]
 
 
 def test_interrupt_is_one_line_and_code_130(monkeypatch, capsys):

@@ -31,10 +31,10 @@ from saccade.shared.bus.wire import MAX_BYTES, decode, encode
 from saccade.shared.config import Config
 from saccade.shared.errors import SaccadeError
 from saccade.shared.loop.local import run_local
-from saccade.shared.loop.main import main, serve
+from saccade.shared.loop.main import run_module, serve
 from saccade.shared.loop.process import Inbox
 from saccade.shared.loop.service import Service
-from saccade.tests.fakes.services import SERVICES, FakePlanner, pairs
+from saccade.tests.fakes.services import SERVICES, module, pairs
 from saccade.tests.samples import array_fields, sample
 
 PARTS = ("mug", "can")
@@ -279,7 +279,7 @@ def test_a_service_that_cannot_run_says_so_in_one_line(tmp_path, capsys, changes
     path = tmp_path / "config.json"
     path.write_text(json.dumps({"scene": {"names": list(PARTS)}} | changes))
     with pytest.raises(SystemExit) as caught:
-        main(SERVICES["planner"], lambda config: FakePlanner(), argv=["--config", str(path)])
+        run_module(module("planner"), argv=["--config", str(path)])
     assert caught.value.code == 2
     error = capsys.readouterr().err
     assert error.startswith("saccade: ")

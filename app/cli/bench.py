@@ -7,17 +7,8 @@ from typing import Annotated, Literal
 
 import typer
 
-from saccade.app.cli.options import (
-    ConfigFile,
-    Objects,
-    ScenesFile,
-    Seed,
-    Values,
-    WeightsFolder,
-    command_line,
-    configured,
-    wide,
-)
+from saccade.app.cli.options import ConfigFile, Objects, ScenesFile, Seed, Values, WeightsFolder, command_line, wide
+from saccade.app.cli.texts import configured
 from saccade.shared.errors import SaccadeError
 
 app = typer.Typer()

@@ -7,7 +7,8 @@ from typing import Annotated, Literal
 
 import typer
 
-from saccade.app.cli.options import Values, parse_value, wide
+from saccade.app.cli.options import Values, wide
+from saccade.app.cli.texts import parse_value
 
 app = typer.Typer()
 

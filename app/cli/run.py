@@ -8,19 +8,8 @@ from typing import Annotated, Literal
 
 import typer
 
-from saccade.app.cli.options import (
-    ConfigFile,
-    Names,
-    Objects,
-    ScenesFile,
-    Seed,
-    Values,
-    WeightsFolder,
-    Yaw,
-    configured,
-    numbers,
-    split_names,
-)
+from saccade.app.cli.options import ConfigFile, Names, Objects, ScenesFile, Seed, Values, WeightsFolder, Yaw
+from saccade.app.cli.texts import configured, numbers, split_names
 from saccade.shared.errors import SaccadeError
 
 app = typer.Typer()

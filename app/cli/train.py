@@ -7,7 +7,8 @@ from typing import Annotated, Literal
 
 import typer
 
-from saccade.app.cli.options import Names, Objects, Seed, WeightsFolder, parse_value, split_names
+from saccade.app.cli.options import Names, Objects, Seed, WeightsFolder
+from saccade.app.cli.texts import parse_value, split_names
 
 app = typer.Typer()
 

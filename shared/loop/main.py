@@ -48,10 +48,10 @@ def run_module(module: ServiceModule, argv: Sequence[str] | None = None) -> None
 
 
 def _work(module: ServiceModule, config: Config, folder: Path, inbox: Inbox) -> None:
-    core = module.build(config)
+    names, core = config.names, module.build(config)
     bus = ZenohBus(config.bus.endpoint, world=config.bus.world)
     try:
-        serve(module.service, core, bus, config.names, run=config.run or folder.name,
+        serve(module.service, core, bus, names, run=config.run or folder.name,
               wait_for=config.bus.wait_for, inbox=inbox, live=config.bus.live, first_step=config.bus.first_step)
     finally:
         bus.close()

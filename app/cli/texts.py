@@ -1,0 +1,42 @@
+"""What the texts of a command line mean: a configuration and its values. Loads nothing heavy before it is asked."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from saccade.shared.errors import SaccadeError
+
+
+def configured(path: Path | None, given: dict[str, Any], values: list[str] | None) -> Any:
+    """The configuration: the file's, then the options that were given, then `--set`."""
+    from saccade.shared.config import load
+
+    options = {key: value for key, value in given.items() if value is not None}
+    return load(path).with_values(options | dict(parse_value(text) for text in values or ()))
+
+
+def parse_value(text: str) -> tuple[str, Any]:
+    """KEY=VALUE as (key, value): JSON where it is JSON, else text."""
+    from json import loads
+
+    key, equals, value = text.partition("=")
+    if not equals or not key:
+        raise SaccadeError(f"--set {text!r}: write KEY=VALUE, such as planner.step_m=0.03")
+    try:
+        return key, loads(value)
+    except ValueError:
+        return key, value
+
+
+def split_names(names: str | None) -> list[str] | None:
+    """The objects in a,b."""
+    return None if names is None else [name.strip() for name in names.split(",") if name.strip()]
+
+
+def numbers(text: str | None) -> list[float] | None:
+    """The numbers in a,b; their count and size are for the configuration to check."""
+    try:
+        return None if text is None else [float(part) for part in text.split(",")]
+    except ValueError as error:
+        raise SaccadeError(f"--intrinsics {text!r}: write fx,fy,cx,cy, such as 615,615,320,240") from error
