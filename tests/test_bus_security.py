@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -16,6 +17,7 @@ import pytest
 from saccade.app.log.check import missing
 from saccade.deploy.zenoh.access import access_control, declared, users
 from saccade.deploy.zenoh.make import make
+from saccade.shared.errors import SaccadeError
 
 ADDRESS, OTHER = "10.199.7.1", "10.199.7.2"
 ENDPOINT = f"tls/{ADDRESS}:7447"
@@ -164,9 +166,35 @@ def test_a_configuration_that_is_none_is_told(tmp_path):
     assert f"ZENOH_CONFIG={tmp_path / 'z.json5'}: no configuration of Zenoh's" in done.stderr
 
 
-def test_the_files_are_for_their_owner_and_made_once(tmp_path):
+def test_the_files_are_for_their_owner_from_the_moment_they_exist(tmp_path, monkeypatch):
+    """With a umask that forbids nothing. No mode is changed afterwards, so each is the one at the file's creation."""
+    def changed(*_: object, **__: object) -> None:
+        raise AssertionError("a mode is changed after the creation")
+
+    (tmp_path / "bin").mkdir()
+    program = tmp_path / "bin" / "openssl"  # the real one, then the modes of what lies there as it ends
+    program.write_text(f'#!/bin/sh\n{shutil.which("openssl")} "$@" || exit\n'
+                       f'stat -c "%a %n" {tmp_path / "bus"}/* >> {tmp_path / "modes"}\n')
+    program.chmod(0o755)
+    for name in ("chmod", "fchmod", "lchmod"):
+        monkeypatch.setattr(os, name, changed, raising=False)
+    monkeypatch.setenv("PATH", str(program.parent), prepend=os.pathsep)
+    before = os.umask(0)
+    try:
+        make(tmp_path / "bus", [ADDRESS])
+    finally:
+        os.umask(before)
+    assert (tmp_path / "bus").stat().st_mode & 0o777 == 0o700
+    files = list((tmp_path / "bus").iterdir())
+    assert {f"{name}.key" for name in (*users(), "router", "authority")} <= {file.name for file in files}
+    assert [file.name for file in files if file.stat().st_mode & 0o777 != 0o600] == []
+    assert {line.split()[0] for line in (tmp_path / "modes").read_text().splitlines()} == {"600"}
+
+
+def test_the_files_are_made_once(tmp_path):
     make(tmp_path / "bus", ["router.example", ADDRESS])
-    assert (tmp_path / "bus").stat().st_mode & 0o077 == 0
+    with pytest.raises(SaccadeError, match=r"bus cannot be made .*: name a new folder"):
+        make(tmp_path / "bus", [ADDRESS])
     passwords = dict(line.split(":") for line in (tmp_path / "bus" / "users.txt").read_text().split())
     assert set(passwords) == set(users())
     assert len(set(passwords.values())) == len(passwords)

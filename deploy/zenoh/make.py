@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import secrets
 import subprocess
 import sys
@@ -27,24 +28,23 @@ def make(folder: Path, hosts: Sequence[str], where: Path | None = None) -> None:
     where the folder is there already, and where openssl is not."""
     where = where or folder.resolve()
     try:
-        folder.mkdir(parents=True)
+        folder.mkdir(mode=0o700, parents=True)
     except OSError as error:
         raise SaccadeError(f"{folder} cannot be made ({error.strerror}): name a new folder") from error
-    folder.chmod(0o700)
     _openssl("req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes", "-days", str(DAYS),
              "-subj", "/CN=saccade", "-keyout", folder / f"{AUTHORITY}.key", "-out", folder / f"{AUTHORITY}.pem")
     passwords = {user: secrets.token_urlsafe(24) for user in users()}
-    (folder / "users.txt").write_text("".join(f"{user}:{password}\n" for user, password in passwords.items()))
+    _write(folder / "users.txt", "".join(f"{user}:{password}\n" for user, password in passwords.items()))
     names = [f"IP:{host}" if host.replace(".", "").isdigit() or ":" in host else f"DNS:{host}" for host in hosts]
     _certify(folder, ROUTER, ",".join(names))
     tls = {"root_ca_certificate": str(where / f"{AUTHORITY}.pem"), "enable_mtls": True}
-    _write(folder / f"{ROUTER}.json5", {
+    _write_tree(folder / f"{ROUTER}.json5", {
         "transport": {"link": {"tls": {**tls, **_pair(where, ROUTER, "listen")}},
                       "auth": {"usrpwd": {"dictionary_file": str(where / "users.txt")}}},
         "access_control": access_control()})
     for user, password in passwords.items():
         _certify(folder, user, f"DNS:{user}")
-        _write(folder / f"{user}.json5", {
+        _write_tree(folder / f"{user}.json5", {
             "transport": {"link": {"tls": {**tls, **_pair(where, user, "connect")}},
                           "auth": {"usrpwd": {"user": user, "password": password}}}})
 
@@ -53,8 +53,14 @@ def _pair(where: Path, name: str, role: str) -> dict[str, str]:
     return {f"{role}_certificate": str(where / f"{name}.pem"), f"{role}_private_key": str(where / f"{name}.key")}
 
 
-def _write(path: Path, tree: dict) -> None:
-    path.write_text(json.dumps(tree, indent=1) + "\n")
+def _write_tree(path: Path, tree: dict) -> None:
+    _write(path, json.dumps(tree, indent=1) + "\n")
+
+
+def _write(path: Path, text: str) -> None:
+    """Writes a new file that only its owner can read, from the moment it exists."""
+    with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
+        file.write(text)
 
 
 def _certify(folder: Path, name: str, alternative: str) -> None:
@@ -62,7 +68,7 @@ def _certify(folder: Path, name: str, alternative: str) -> None:
     _openssl("req", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes", "-subj", f"/CN={name}",
              "-keyout", folder / f"{name}.key", "-out", request)
     extensions = folder / f"{name}.ext"
-    extensions.write_text(f"subjectAltName={alternative}\nextendedKeyUsage=serverAuth,clientAuth\n")
+    _write(extensions, f"subjectAltName={alternative}\nextendedKeyUsage=serverAuth,clientAuth\n")
     _openssl("x509", "-req", "-in", request, "-CA", folder / f"{AUTHORITY}.pem", "-CAkey", folder / f"{AUTHORITY}.key",
              "-CAcreateserial", "-days", str(DAYS), "-extfile", extensions, "-out", folder / f"{name}.pem")
     request.unlink()
@@ -71,7 +77,7 @@ def _certify(folder: Path, name: str, alternative: str) -> None:
 
 def _openssl(*arguments: str | Path) -> None:
     try:
-        subprocess.run(["openssl", *map(str, arguments)], check=True, capture_output=True, text=True)
+        subprocess.run(["openssl", *map(str, arguments)], check=True, capture_output=True, text=True, umask=0o077)
     except OSError as error:
         raise SaccadeError("openssl is needed to make certificates: install it") from error
     except subprocess.CalledProcessError as error:
