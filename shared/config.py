@@ -5,21 +5,35 @@ The text under each key is its description in the guide's reference.
 
 from __future__ import annotations
 
-import json
-import tomllib
+import os
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, field_validator
 
-from saccade.shared.errors import SaccadeError
+from saccade.shared.errors import SaccadeError, is_text, told
+from saccade.shared.files import MIB, parse_json, parse_toml, read_text, replace_whole, size_of, writing
 
 PACKAGE = Path(__file__).resolve().parent.parent  # the folder of `saccade`: in a checkout the repository
 PRESETS, WEIGHTS = PACKAGE / "shared" / "presets", PACKAGE / "weights"
 
+MAX_FILE_BYTES = 1 * MIB
+MAX_TEXT = 1024  # characters of a value; paths are the longest
+MANY = 1_000_000  # steps, scenes and the like: more would never end
+_NEED = "give a file of TOML or JSON, or leave it out for the default"
+
 
 class Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True, allow_inf_nan=False)
+
+    @field_validator("*")
+    @classmethod
+    def _can_be_told(cls, value: Any) -> Any:
+        """Texts go into messages, file names and onto terminals."""
+        for text in value if isinstance(value, tuple) else (value,):
+            if isinstance(text, str | Path) and not (len(str(text)) <= MAX_TEXT and is_text(str(text))):
+                raise ValueError(f"a text must be Unicode, without control codes, of at most {MAX_TEXT} characters")
+        return value
 
 
 Checked = TypeVar("Checked", bound=Section)
@@ -42,7 +56,7 @@ class BusConfig(Section):
     """Services that must be ready before the source begins. The launcher fills this in."""
     live: bool = False
     """Nobody waits: each service takes the newest step and reports how many it skipped. Set for real cameras."""
-    first_step: int = Field(0, ge=0)
+    first_step: int = Field(0, ge=0, lt=2 ** 63)
     """First step of an episode. The replay of a log that was cut begins later than at 0."""
 
 
@@ -57,7 +71,7 @@ class SceneConfig(Section):
     """Scenes file (JSON)."""
     scene: str | None = None
     """Id of one scene in the file. Without it, all scenes of the file are run."""
-    count: int = Field(1, ge=1)
+    count: int = Field(1, ge=1, le=MANY)
     """How many scenes are drawn."""
     n_objects: int | None = Field(None, ge=1, le=20)
     """How many objects stand on the table. Without it, the number is drawn."""
@@ -77,7 +91,7 @@ class SceneConfig(Section):
 class SimulatorConfig(Section):
     """The paper's environment (section 4.1)."""
 
-    max_steps: int = Field(350, ge=1)
+    max_steps: int = Field(350, ge=1, le=MANY)
     """Steps after which an episode ends."""
     until: Literal["reached", "declared"] = "reached"
     """`reached`: an episode ends at the first step within the tolerance, as in the paper. `declared`: it ends when the
@@ -136,9 +150,9 @@ class BeliefConfig(Section):
     """Particles are resampled when their effective share falls below this."""
     missed_weight: float = Field(0.3, gt=0, le=1)
     """Factor by which a particle loses weight when its object should have been seen and was not."""
-    published_particles: int = Field(512, ge=16)
+    published_particles: int = Field(512, ge=16, le=MANY)
     """How many particles a belief message carries."""
-    keyframes: int = Field(24, ge=1)
+    keyframes: int = Field(24, ge=1, le=MANY)
     """How many views of an object are kept for its pose."""
     view_worth: float = Field(0.5, gt=0, le=1)
     """How much one view counts for the pose."""
@@ -151,7 +165,7 @@ class PlannerConfig(Section):
 
     candidates: int = Field(5_000, ge=10, le=1_000_000)
     """How many candidate viewpoints are drawn."""
-    replan_every: int = Field(10, ge=1)
+    replan_every: int = Field(10, ge=1, le=MANY)
     """A new viewpoint is chosen after this many steps, or on arrival."""
     step_m: float = Field(0.05, gt=0, le=0.5)
     """How far the camera moves in one step."""
@@ -198,9 +212,9 @@ class ViewerConfig(Section):
 class Config(Section):
     """A run."""
 
-    run: str | None = None
+    run: str | None = Field(None, max_length=256)
     """Name of the run. Without it, the name of its folder."""
-    seed: int = Field(0, ge=0)
+    seed: int = Field(0, ge=0, lt=2 ** 63)
     """Seed of everything random."""
     bus: BusConfig = BusConfig()
     scene: SceneConfig = SceneConfig()
@@ -234,13 +248,15 @@ class Config(Section):
             for parent in parents:
                 node = node.get(parent) if isinstance(node, dict) else None
             if not isinstance(node, dict) or last not in node:
-                raise SaccadeError(f"configuration key {dotted!r} is unknown: see shared/config.py")
+                raise SaccadeError(f"configuration key {told(dotted)} is unknown: see shared/config.py")
             node[last] = str(value) if isinstance(value, Path) else value
         return validate(tree, "command line")
 
     def save(self, path: Path) -> None:
-        """Writes the resolved configuration as JSON; `load` reads it back."""
-        path.write_text(self.model_dump_json(indent=2) + "\n")
+        """Writes the resolved configuration as JSON, which `load` reads back: whole or not at all. Raises SaccadeError
+        where it cannot be written."""
+        with writing(path, "configuration"):
+            replace_whole(path, (self.model_dump_json(indent=2) + "\n").encode())
 
 
 def validate(tree: dict[str, Any], where: str) -> Config:
@@ -255,22 +271,31 @@ def checked(model: type[Checked], tree: dict[str, Any], what: str) -> Checked:
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
-        raise SaccadeError(f"{what.replace('{}', repr(key))}: {first['msg']}") from error
+        raise SaccadeError(f"{what.replace('{}', told(key))}: {first['msg'].removeprefix('Value error, ')}") from error
+
+
+def recorded(text: str | None, where: str) -> Config:
+    """The configuration that a log holds, the default where it holds none. Raises SaccadeError for a damaged one."""
+    if text is not None and len(text) > MAX_FILE_BYTES:
+        raise SaccadeError(f"the configuration in {where} is larger than {size_of(MAX_FILE_BYTES)}: give another log")
+    try:
+        return validate(parse_json(text or "{}"), where)
+    except ValueError as error:
+        raise SaccadeError(f"the configuration in {where} is damaged ({error}): give another log, or look at this "
+                           "one's messages with `saccade echo --log`") from error
 
 
 def load(path: Path | None) -> Config:
     """Reads TOML or JSON, or a preset by its name (`default`, `paper`); the default where no path is given."""
     if path is None or str(path) == "default":
         return Config()
-    if (PRESETS / f"{path}.toml").is_file():
+    if os.path.isfile(PRESETS / f"{path}.toml"):
         path = PRESETS / f"{path}.toml"
+    text = read_text(path, "configuration", _NEED, MAX_FILE_BYTES)
     try:
-        text = path.read_text()
-        tree = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
-    except OSError as error:
-        raise SaccadeError(f"configuration {path} cannot be read: {error.strerror}") from error
+        tree = parse_json(text) if path.suffix == ".json" else parse_toml(text)
     except ValueError as error:
-        raise SaccadeError(f"configuration {path} is neither TOML nor JSON: {error}") from error
+        raise SaccadeError(f"configuration {path} is neither TOML nor JSON ({error}): {_NEED}") from error
     return validate(tree, str(path))
 
 
@@ -279,4 +304,4 @@ def weights_folder(name: str | Path | None) -> Path | None:
     if not name:
         return None
     path = Path(name)
-    return path if path.is_absolute() or path.is_dir() else WEIGHTS / path
+    return path if path.is_absolute() or os.path.isdir(path) else WEIGHTS / path

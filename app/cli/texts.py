@@ -18,13 +18,13 @@ def configured(path: Path | None, given: dict[str, Any], values: list[str] | Non
 
 def parse_value(text: str) -> tuple[str, Any]:
     """KEY=VALUE as (key, value): JSON where it is JSON, else text."""
-    from json import loads
+    from saccade.shared.files import parse_json
 
     key, equals, value = text.partition("=")
     if not equals or not key:
         raise SaccadeError(f"--set {text!r}: write KEY=VALUE, such as planner.step_m=0.03")
     try:
-        return key, loads(value)
+        return key, parse_json(value)
     except ValueError:
         return key, value
 

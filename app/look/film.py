@@ -3,7 +3,6 @@ the view that is planned, step by step."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -27,7 +26,7 @@ from saccade.services.viewer.imagination import Imagination
 from saccade.services.viewer.words import decision, ending, plain
 from saccade.shared.bus.messages import Belief, Message, Percept, Plan, Result, Truth
 from saccade.shared.bus.topics import FRAME, PERCEPT, Topic
-from saccade.shared.config import Config, validate
+from saccade.shared.config import Config, recorded
 from saccade.shared.errors import SaccadeError
 from saccade.shared.log.reading import RunReader
 from saccade.shared.model.weights import Weights
@@ -111,7 +110,7 @@ def scenes(log: Path, episode: int) -> Iterator[tuple[Scene, Imagination | None]
     reader, scene, imagination, begun = RunReader(log), Scene(Story(episode)), None, False
     for topic, part, message in reader:
         if not begun:
-            config = validate(json.loads(reader.configuration or "{}"), f"the log {log}")
+            config = recorded(reader.configuration, f"the log {log}")
             imagination, begun = imagination_of(config), True
             scene.story.goal_is_known = config.scene.goal_view_is_known
         if not topic.in_step or message.episode != episode:

@@ -3,7 +3,6 @@ the free energy."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from itertools import cycle
@@ -19,6 +18,7 @@ from saccade.app.palette import COLOURS
 from saccade.services.simulator.world import TABLE_SIDE_M
 from saccade.shared.bus.messages import Belief, Frame, Goal, Message, Plan, Result, Truth
 from saccade.shared.bus.topics import BELIEF, FRAME, GOAL, PLAN, RESULT, TRUTH
+from saccade.shared.config import recorded
 from saccade.shared.errors import SaccadeError
 from saccade.shared.log.folder import LOG_NAME, PICTURE_NAME
 from saccade.shared.log.reading import RunReader
@@ -92,8 +92,7 @@ def read_story(log: Path, episode: int | None = None) -> Story:
 
 
 def _goal_from_elsewhere(reader: RunReader) -> bool:
-    scene = json.loads(reader.configuration or "{}").get("scene", {})
-    return scene.get("goal_image") is not None
+    return recorded(reader.configuration, f"the log {reader.path}").scene.goal_image is not None
 
 
 def draw(log: Path, out: Path, episode: int | None = None) -> Story:

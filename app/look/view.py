@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 import webbrowser
 from collections.abc import Callable
@@ -21,7 +20,7 @@ from saccade.services.viewer.priority import come_last
 from saccade.services.viewer.server import Server, with_free_ports
 from saccade.shared.bus.topics import GOAL_PERCEPT
 from saccade.shared.bus.transport import ZenohBus
-from saccade.shared.config import Config, ViewerConfig, validate
+from saccade.shared.config import Config, ViewerConfig, recorded
 from saccade.shared.log.folder import LOG_NAME
 from saccade.shared.loop.process import Health, Inbox
 
@@ -96,7 +95,7 @@ def _show(log: Log, recording: rr.RecordingStream, truth: bool, weights: Path | 
     viewer = None
     for entry, message in log:
         if viewer is None:  # the configuration stands before the first message
-            config = validate(json.loads(log.reader.configuration or "{}"), f"the log {log.reader.path}")
+            config = recorded(log.reader.configuration, f"the log {log.reader.path}")
             viewer = Viewer(recording, _with_weights(config, weights), truth=truth, live=False)
         viewer.take(entry.topic, entry.part, message)
     if viewer is not None:

@@ -1,0 +1,147 @@
+"""Files from outside: only regular ones are opened, and only as many bytes as are sane are read of them.
+
+A FIFO, a socket or a device could block for ever; a huge or a deep file would fill the memory before it is refused.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import stat
+import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from saccade.shared.errors import SaccadeError, told
+
+MIB = 1024 * 1024
+MAX_DEPTH = 64  # of lists and maps within one another
+MAX_VALUES = 4_000_000  # in one file: so many take some hundred megabytes
+MAX_KEY_PARTS = 32  # of a dotted key in TOML: reading it takes their number squared
+KINDS = {stat.S_IFDIR: "a folder", stat.S_IFIFO: "a FIFO", stat.S_IFSOCK: "a socket", stat.S_IFCHR: "a device",
+         stat.S_IFBLK: "a device"}
+
+_PART = r"""(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')"""
+_LONG_KEY = re.compile(rf"(?<![A-Za-z0-9_-])(?:{_PART}[ \t]*+\.[ \t]*+){{{MAX_KEY_PARTS}}}")
+
+
+def size_of(number: int) -> str:
+    """A size in words."""
+    return f"{number // MIB} MiB" if number >= MIB else f"{number} bytes"
+
+
+@contextmanager
+def opened(path: Path, what: str, need: str, limit: int) -> Iterator[BinaryIO]:
+    """A regular file of at most `limit` bytes, open for reading; it never blocks. Raises SaccadeError, which begins
+    with `what` and the path and ends with `need`, also where reading fails within the context."""
+    with _open(path, what, need, limit) as stream:
+        try:
+            yield stream
+        except OSError as error:
+            raise SaccadeError(f"{what} {path} cannot be read ({error.strerror or error}): {need}") from error
+
+
+def _open(path: Path, what: str, need: str, limit: int) -> BinaryIO:
+    try:
+        _require_regular(os.stat(path), path, what, need)  # first: opening a device may do something
+        stream = os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb")
+    except (OSError, ValueError) as error:  # ValueError: a path that no file can have
+        raise SaccadeError(f"{what} {path} cannot be read ({getattr(error, 'strerror', error)}): {need}") from error
+    try:
+        found = os.fstat(stream.fileno())
+        _require_regular(found, path, what, need)
+        if found.st_size > limit:
+            raise SaccadeError(f"{what} {path} is larger than {size_of(limit)}: {need}")
+    except BaseException:
+        stream.close()
+        raise
+    return stream
+
+
+def _require_regular(found: os.stat_result, path: Path, what: str, need: str) -> None:
+    if not stat.S_ISREG(found.st_mode):
+        kind = KINDS.get(stat.S_IFMT(found.st_mode), "something else")
+        raise SaccadeError(f"{what} {path} cannot be read (it is {kind}, not a file): {need}")
+
+
+def read_bytes(path: Path, what: str, need: str, limit: int) -> bytes:
+    """The bytes of a file. Raises SaccadeError as `opened`."""
+    with opened(path, what, need, limit) as stream:
+        data = stream.read(limit + 1) or b""
+    if len(data) > limit:  # it grew, or is one that does not tell its size
+        raise SaccadeError(f"{what} {path} is larger than {size_of(limit)}: {need}")
+    return data
+
+
+def read_text(path: Path, what: str, need: str, limit: int) -> str:
+    """The text of a file in UTF-8, its lines ending in a line feed. Raises SaccadeError as `opened`."""
+    try:
+        return read_bytes(path, what, need, limit).decode().replace("\r\n", "\n")
+    except UnicodeDecodeError as error:
+        raise SaccadeError(f"{what} {path} is not a text in UTF-8 (byte {error.start}): {need}") from error
+
+
+def parse_json(text: str, *, max_values: int = MAX_VALUES) -> Any:
+    """What a text in JSON holds. Raises ValueError for what is none, too deep, too much, or says a key twice."""
+    if text.count(",") + text.count("[") + text.count("{") > max_values:
+        raise ValueError(f"it holds more than {max_values} values")
+    try:
+        tree = json.loads(text, object_pairs_hook=_unique)
+    except RecursionError as error:
+        raise ValueError(f"it is nested deeper than {MAX_DEPTH} levels") from error
+    _require_flat(tree)
+    return tree
+
+
+def parse_toml(text: str) -> dict[str, Any]:
+    """What a text in TOML holds. Raises ValueError for what is none, too deep, or has an endless key."""
+    if _LONG_KEY.search(text):
+        raise ValueError(f"a key has more than {MAX_KEY_PARTS} parts")
+    try:
+        tree = tomllib.loads(text)
+    except RecursionError as error:
+        raise ValueError(f"it is nested deeper than {MAX_DEPTH} levels") from error
+    _require_flat(tree)
+    return tree
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    tree: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in tree:
+            raise ValueError(f"key {told(key)} is there twice in one map")
+        tree[key] = value
+    return tree
+
+
+def _require_flat(tree: Any) -> None:
+    level = [tree]
+    for _ in range(MAX_DEPTH):
+        level = [child for node in level if isinstance(node, (dict, list))
+                 for child in (node.values() if isinstance(node, dict) else node)]
+        if not level:
+            return
+    raise ValueError(f"it is nested deeper than {MAX_DEPTH} levels")
+
+
+@contextmanager
+def writing(path: Path, what: str) -> Iterator[None]:
+    """Around whatever writes there: a disk that is full, a folder that is read-only and the like raise SaccadeError."""
+    try:
+        yield
+    except OSError as error:
+        raise SaccadeError(f"{what} {path} cannot be written ({error.strerror or error}): free some space, or name a "
+                           "place where you may write") from error
+
+
+def replace_whole(path: Path, data: bytes) -> None:
+    """Writes a file that is there whole or as it was before. Raises OSError."""
+    draft = path.with_name(f"{path.name}.part")
+    try:
+        draft.write_bytes(data)
+        draft.replace(path)
+    finally:
+        draft.unlink(missing_ok=True)
