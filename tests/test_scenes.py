@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 
+from saccade.services.simulator import scenes as scenes_module
 from saccade.services.simulator.objects import YCB_NAMES
 from saccade.services.simulator.scenes import (
     PAPER_SCENES,
@@ -17,6 +18,7 @@ from saccade.services.simulator.scenes import (
     save_scenes,
 )
 from saccade.shared.errors import SaccadeError
+from saccade.shared.files import MAX_VALUES
 from saccade.shared.world.geometry import rotation_angle, rotation_towards
 from saccade.shared.world.task import LOWER_M, UPPER_M, spheres_around
 
@@ -73,6 +75,20 @@ BAD = {
     "no rotation": (entry(goal_world_from_camera=(2 * np.eye(4)).tolist()), "not a rigid transform"),
     "mirrored": (entry(goal_world_from_camera=np.diag([1, 1, -1, 1]).tolist()), "not a rigid transform"),
     "colour": (entry(table_rgb=[0, 0, 256]), "table_rgb"),
+    "far": (entry(objects=placed(center_xyz_m=[1e300, 0, 0])), "center_xyz_m must be within ±10"),
+    "whole and far": (entry(objects=placed(center_xyz_m=[10 ** 400, 0, 0])), "center_xyz_m is larger"),
+    "far goal": (entry(goal_world_from_camera=[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 99], [0, 0, 0, 1]]),
+                 "goal_world_from_camera must be within"),
+    "yaw": (entry(objects=placed(yaw_rad=1e30)), "yaw_rad must be within"),
+    "bool": (entry(objects=placed(center_xyz_m=[True, 0.5, 0])), "center_xyz_m must be numbers of shape"),
+    "texts": (entry(objects=placed(center_xyz_m=["x" * 10 ** 6, "y", "z"])), "center_xyz_m must be numbers of shape"),
+    "many": (entry(table_rgb=[1] * 10 ** 5), "table_rgb must be numbers of shape"),
+    "long id": (entry(id="x" * 5000), "id has 5000 characters: shorten it to 256"),
+    "control codes": (entry(id="\x1b[31mred\n"), "'\\x1b[31mred\\n': id must be Unicode without control codes"),
+    "half a character": (entry(id="\ud800"), "'\\ud800': id must be Unicode"),
+    "long name": (entry(objects=placed(name="x" * 300)), "name has 300 characters"),
+    "id is a map": (entry(id={"a": [[[[[[[[1]]]]]]]]}), "id must be a text"),
+    "target is a list": (entry(target=[[["can"]]]), "not among its objects"),
     "flag": (entry(target_absent="yes"), "target_absent must be"),
 }
 
@@ -106,6 +122,28 @@ def test_a_damaged_file_is_refused(tmp_path, text):
     path.write_bytes(text.encode("latin-1"))
     with pytest.raises(SaccadeError, match=str(path)):
         load_scenes(path)
+
+
+def test_a_deep_file_or_one_that_says_a_key_twice_is_refused(tmp_path):
+    for text, words in (('{"scenes": ' + "[" * 10 ** 5, "nested deeper"),
+                        ('{"scenes": [{"id": "a", "id": "b"}]}', "key 'id' is there twice")):
+        (tmp_path / "s.json").write_text(text)
+        with pytest.raises(SaccadeError, match=words):
+            load_scenes(tmp_path / "s.json")
+
+
+def test_a_large_file_is_refused_by_its_size_and_then_by_its_numbers(tmp_path, monkeypatch):
+    """A file of 1 GB took a minute and 6 GB before it was refused."""
+    with (tmp_path / "s.json").open("wb") as file:
+        file.truncate(2 ** 40)
+    with pytest.raises(SaccadeError, match="is larger than 64 MiB"):
+        load_scenes(tmp_path / "s.json")
+    (tmp_path / "s.json").write_text('{"scenes": [' + "{}," * (MAX_VALUES + 1) + "{}]}")
+    with pytest.raises(SaccadeError, match="holds more than 4000000 values"):
+        load_scenes(tmp_path / "s.json")
+    monkeypatch.setattr(scenes_module, "MAX_SCENES", 1)
+    with pytest.raises(SaccadeError, match="holds 2 scenes, more than 1"):
+        load_scenes(write(tmp_path / "s.json", entry(), entry(id="b")))
 
 
 def test_a_missing_file_is_named(tmp_path):

@@ -15,7 +15,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from saccade.shared.errors import SaccadeError
+from saccade.shared.errors import SaccadeError, is_text, told
+from saccade.shared.files import MIB, parse_json, read_text, replace_whole, writing
 from saccade.shared.world.geometry import direction, look_at
 from saccade.shared.world.task import GOAL_CLEARANCE_M, clip, spheres_around
 
@@ -24,6 +25,10 @@ SCENE_KEYS = {"id", "target", "table_rgb", "objects", "goal_world_from_camera"}
 OBJECT_KEYS = {"name", "center_xyz_m", "yaw_rad"}
 HALF_SPREAD_M = 0.25  # objects stand in [-0.25, 0.25]^2
 GOAL_RANGE_MAX_M = 0.50
+MAX_FILE_BYTES, MAX_SCENES = 64 * MIB, 20_000
+MAX_ID = 256  # characters of an id or a name: it is in messages and in file names
+MAX_NUMBERS = {"center_xyz_m": 10.0, "goal_world_from_camera": 10.0, "yaw_rad": 1e4}  # what is further is not seen
+_NEED = "give a scenes file"
 _TRIES = 100  # per object, before the whole table is cleared and laid anew
 
 Sizes = Mapping[str, ArrayLike]  # name -> extents [3] of the object's box, metres
@@ -68,15 +73,16 @@ def load_scenes(path: Path, names: Sequence[str] | None = None) -> list[Scene]:
 
     Raises SaccadeError, in one line with the file and the scene, for anything missing, damaged or contradictory.
     """
+    text = read_text(path, "scenes", _NEED, MAX_FILE_BYTES)
     try:
-        tree = json.loads(path.read_text())
-    except OSError as error:
-        raise SaccadeError(f"scenes {path} cannot be read ({error.strerror}): give a scenes file") from error
+        tree = parse_json(text)
     except ValueError as error:
         raise SaccadeError(f"scenes {path} is not JSON ({error}): write it with save_scenes") from error
     entries = tree.get("scenes") if isinstance(tree, dict) else None
     if not isinstance(entries, list) or not entries:
         raise SaccadeError(f'scenes {path} holds no scenes: it must be {{"scenes": [...]}} with at least one')
+    if len(entries) > MAX_SCENES:
+        raise SaccadeError(f"scenes {path} holds {len(entries)} scenes, more than {MAX_SCENES}: split it")
     scenes: dict[str, Scene] = {}
     for index, entry in enumerate(entries):
         name = entry.get("id", index) if isinstance(entry, dict) else index
@@ -85,15 +91,14 @@ def load_scenes(path: Path, names: Sequence[str] | None = None) -> list[Scene]:
             if scene.id in scenes:
                 raise ValueError("its id occurs twice: make ids unique")
         except (ValueError, TypeError, KeyError, OverflowError) as error:
-            raise SaccadeError(f"scenes {path}, scene {name!r}: {error}") from error
+            raise SaccadeError(f"scenes {path}, scene {told(name)}: {error}") from error
         scenes[scene.id] = scene
     return list(scenes.values())
 
 
 def _scene(entry: Any, names: Sequence[str] | None) -> Scene:
     _check_keys(entry, SCENE_KEYS, {"target_absent"})
-    if not isinstance(entry["id"], str) or not entry["id"]:
-        raise ValueError("id must be a text")
+    _check_text(entry, "id")
     if not isinstance(entry["objects"], list) or not entry["objects"]:
         raise ValueError("objects must be a list of at least one object")
     objects = tuple(_placed(placed, names) for placed in entry["objects"])
@@ -101,8 +106,8 @@ def _scene(entry: Any, names: Sequence[str] | None) -> Scene:
     if len(set(present)) < len(present):
         raise ValueError("an object stands in it twice: name each at most once")
     if entry["target"] not in present:
-        raise ValueError(f"target {entry['target']!r} is not among its objects: add it, with \"target_absent\": true "
-                         "if it must not stand on the table")
+        raise ValueError(f"target {told(entry['target'])} is not among its objects: add it, with "
+                         "\"target_absent\": true if it must not stand on the table")
     absent = entry.get("target_absent", False)
     if not isinstance(absent, bool):
         raise ValueError("target_absent must be true or false")
@@ -121,11 +126,20 @@ def _scene(entry: Any, names: Sequence[str] | None) -> Scene:
 def _placed(entry: Any, names: Sequence[str] | None) -> Placed:
     _check_keys(entry, OBJECT_KEYS)
     name = entry["name"]
-    if not isinstance(name, str):
-        raise ValueError("an object's name must be a text")
+    _check_text(entry, "name")
     if names is not None and name not in names:
-        raise ValueError(f"object {name!r} is not in use: choose the set that has it (have {', '.join(names)})")
+        raise ValueError(f"object {told(name)} is not in use: choose the set that has it (have {', '.join(names)})")
     return Placed(name, _numbers(entry, "center_xyz_m", (3,)), float(_numbers(entry, "yaw_rad", ())))
+
+
+def _check_text(entry: dict[str, Any], key: str) -> None:
+    text = entry[key]
+    if not isinstance(text, str) or not text:
+        raise ValueError(f"{key} must be a text")
+    if len(text) > MAX_ID:
+        raise ValueError(f"{key} has {len(text)} characters: shorten it to {MAX_ID}")
+    if not is_text(text):
+        raise ValueError(f"{key} must be Unicode without control codes: remove what is none")
 
 
 def _check_keys(entry: Any, required: Set[str], optional: Set[str] = frozenset()) -> None:
@@ -134,19 +148,28 @@ def _check_keys(entry: Any, required: Set[str], optional: Set[str] = frozenset()
     if missing := sorted(required - entry.keys()):
         raise ValueError(f"{missing[0]} is missing")
     if unknown := sorted(entry.keys() - required - optional):
-        raise ValueError(f"{unknown[0]} is unknown: remove it")
+        raise ValueError(f"{told(unknown[0])[1:-1]} is unknown: remove it")
 
 
 def _numbers(entry: dict[str, Any], key: str, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    try:
-        raw = np.array(entry[key])
-    except ValueError as error:
-        raise ValueError(f"{key} must be numbers of shape {list(shape)}") from error
-    if raw.dtype.kind not in "iuf" or raw.shape != shape:
+    if not _has_shape(entry[key], shape):
         raise ValueError(f"{key} must be numbers of shape {list(shape)}")
+    try:
+        raw = np.array(entry[key], dtype=np.float64)
+    except OverflowError as error:
+        raise ValueError(f"{key} is larger than any number here") from error
     if not np.isfinite(raw).all():
         raise ValueError(f"{key} is not finite")
-    return raw.astype(np.float64)
+    if np.abs(raw).max() > (most := MAX_NUMBERS.get(key, np.inf)):
+        raise ValueError(f"{key} must be within ±{most:g}")
+    return raw
+
+
+def _has_shape(value: Any, shape: tuple[int, ...]) -> bool:
+    """Whether it is lists of that shape with nothing but numbers in them, before an array is made of it."""
+    if not shape:
+        return isinstance(value, int | float) and not isinstance(value, bool)
+    return isinstance(value, list) and len(value) == shape[0] and all(_has_shape(one, shape[1:]) for one in value)
 
 
 def save_scenes(path: Path, scenes: Sequence[Scene]) -> None:
@@ -159,7 +182,9 @@ def save_scenes(path: Path, scenes: Sequence[Scene]) -> None:
                         for p in scene.objects],
             "goal_world_from_camera": scene.goal_world_from_camera.tolist()}
         entries.append(entry | ({"target_absent": True} if scene.target_absent else {}))
-    path.write_text('{"scenes": [\n' + ",\n".join(json.dumps(entry) for entry in entries) + "\n]}\n")
+    text = '{"scenes": [\n' + ",\n".join(json.dumps(entry) for entry in entries) + "\n]}\n"
+    with writing(path, "scenes"):
+        replace_whole(path, text.encode())
 
 
 def generate_scene(rng: np.random.Generator, sizes: Sizes, target: str, n_objects: int, *,
