@@ -1,4 +1,4 @@
-"""`python -m saccade.services.belief --config FILE`: percepts in, beliefs out."""
+"""Runs the belief service, which turns percepts into beliefs: `python -m saccade.services.belief --config FILE`."""
 
 from saccade.shared.loop.main import main
 

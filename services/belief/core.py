@@ -1,4 +1,4 @@
-"""The belief over the scene: per object a position posterior and a posterior over the goal's viewpoint."""
+"""The belief over the scene: for each object, a posterior over its position and one over the goal's viewpoint."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ SERVICE = Service("belief", inputs=(PERCEPT, GOAL_PERCEPT), trigger=PERCEPT, out
 
 Moments = tuple[NDArray[np.float64], NDArray[np.float64]]  # mean [3], covariance [3, 3]
 
-WORTH_COMPARING = 0.05  # chosen: goal presence below which an object's pose is not compared with the goal
-LOCALISED_M = 0.08  # chosen: deviation below which a view's displacement around the object means something
+WORTH_COMPARING = 0.05  # chosen: an object's pose is compared with the goal if its presence in the goal image is higher
+LOCALISED_M = 0.08  # chosen: a view is used for the pose only if the deviation of the object's position is smaller
 
 
 class Energy(TypedDict, total=False):
-    """Those terms of F that a step has, as a belief names them."""
+    """The terms of the variational free energy F that a step has. The names are those of the fields of `Belief`."""
 
     f_identity: float
     f_position: float
@@ -38,7 +38,10 @@ class Energy(TypedDict, total=False):
 
 
 class BeliefFilter:
-    """Percepts in, beliefs out. State: particles and kept views, a fold over the episode's percepts."""
+    """Turns percepts into beliefs. Its state, the particles and the kept views, follows from the episode's percepts.
+
+    Raises SaccadeError if the weights are missing or damaged, or if they lack an object.
+    """
 
     def __init__(self, config: Config, names: tuple[str, ...]):
         self.config, self.names = config, names
@@ -47,7 +50,7 @@ class BeliefFilter:
         self.transitions = {name: LatentTransition(weights, name) for name in names}
 
     def begin(self, run: str, episode: int) -> Iterable[Output]:
-        """A new scene: nothing is known."""
+        """Starts an episode. Nothing is known about its scene yet, and nothing is published."""
         self.episode = episode
         self.positions = {name: PositionFilter(self.config.belief, self._rng(0, f"start {name}"))
                           for name in self.names}
@@ -60,7 +63,7 @@ class BeliefFilter:
         return generator(self.config.seed, self.config.bus.world, self.episode, step, f"belief {what}")
 
     def step(self, inputs: Inputs) -> Iterable[Output]:
-        """One belief per object from all percepts of a step."""
+        """Yields one belief per object, computed from the percepts of all objects at one step."""
         percepts: dict[str, Percept] = inputs["percept"]
         if not self.goal_known:
             self.goal_known = True
@@ -102,7 +105,11 @@ class BeliefFilter:
 
     def _free_energy(self, percept: Percept, prior: float, before: Moments, after: Moments,
                      present: bool) -> Energy:
-        """The terms of F; those of an object that is not seen are what its absence says."""
+        """The terms of F at this step. An object that is not seen has only the identity and the position term.
+
+        `prior` is the probability that the object was expected in this view. `before` and `after` are the moments of
+        its position before and after the image.
+        """
         terms: Energy = {"f_identity": identity_term(percept.presence, prior),
                          "f_position": position_term(before, after)}
         if not present:
@@ -114,5 +121,5 @@ class BeliefFilter:
 
 
 def build(config: Config) -> BeliefFilter:
-    """The core for a run's configuration."""
+    """Creates the core from a run's configuration. Raises SaccadeError if the weights do not serve its objects."""
     return BeliefFilter(config, config.names)

@@ -1,7 +1,7 @@
 """Variational free energy of one object at one step, term by term (paper, appendix A).
 
-The filtering form: what was believed before the image is the prior of what is believed after it, so that F measures how
-much each image still surprises, and falls as the belief sharpens.
+This is the filtering form: the belief before an image is the prior of the belief after it. So F measures how much each
+image still surprises the agent, and it falls as the belief becomes more certain.
 """
 
 from __future__ import annotations
@@ -15,18 +15,22 @@ from saccade.shared.world.geometry import project, spherical, wrap
 
 Array = NDArray[np.float64]
 
-PIXEL_STD = 1.0  # of a crop's colours around their reconstruction: the paper's likelihood is the squared error
-FLOOR = 1e-3
+# Standard deviation of a crop's colours around their reconstruction: the paper's likelihood is the squared error.
+PIXEL_STD = 1.0
+FLOOR = 1e-3  # smallest probability, and deviation (m) that is added to a particle cloud
 
 
 def identity_term(presence: float, prior: float) -> float:
-    """KL[Q(i | o) || P(i)] of Bernoulli variables, nats; `prior`: that the object was expected in this view."""
+    """KL[Q(i | o) || P(i)] of two Bernoulli variables, in nats.
+
+    `presence` is the probability that the object is in the image, `prior` that it was expected in this view.
+    """
     p, q = (float(np.clip(x, FLOOR, 1 - FLOOR)) for x in (presence, prior))
     return p * np.log(p / q) + (1 - p) * np.log((1 - p) / (1 - q))
 
 
 def gaussian_kl(mean: Array, covariance: Array, prior_mean: Array, prior_covariance: Array) -> float:
-    """KL[N(mean, covariance) || N(prior)] in any dimension, nats."""
+    """KL[N(mean, covariance) || N(prior_mean, prior_covariance)] in nats, for means [D] and covariances [D, D]."""
     precision = np.linalg.inv(prior_covariance)
     offset = prior_mean - mean
     logs = np.linalg.slogdet(prior_covariance)[1] - np.linalg.slogdet(covariance)[1]
@@ -34,14 +38,20 @@ def gaussian_kl(mean: Array, covariance: Array, prior_mean: Array, prior_covaria
 
 
 def position_term(before: tuple[Array, Array], after: tuple[Array, Array]) -> float:
-    """KL[Q(t | o) || Q(t)] of the particle cloud's moments (mean [3], covariance [3, 3]) after and before the image."""
+    """KL[Q(t | o) || Q(t)] in nats: the position after the image against the position before it.
+
+    Both are moments of the particle cloud: mean [3] in m, covariance [3, 3] in m^2.
+    """
     noise = np.eye(3) * FLOOR ** 2
     return gaussian_kl(after[0], after[1] + noise, before[0], before[1] + noise)
 
 
 def crop_term(percept: Percept, before: tuple[Array, Array]) -> float:
-    """KL[Q(u | o) || P(u | t, v)] + KL[Q(sigma | o) || P(sigma | t, v)]: pixel and log scale as seen, against what the
-    pinhole camera predicts from the belief before."""
+    """KL[Q(u | o) || P(u | t, v)] + KL[Q(sigma | o) || P(sigma | t, v)] in nats, for pixel u and log scale sigma.
+
+    Q is what was seen. P is what the pinhole camera predicts from the position before the image (mean [3] in m,
+    covariance [3, 3] in m^2). The term is 0 if this position is less than 5 cm in front of the camera, or behind it.
+    """
     mean, covariance = before
     camera, focal = percept.world_from_camera, percept.intrinsics_px[0]
     pixel, depth = project(mean, camera, percept.intrinsics_px)
@@ -60,8 +70,11 @@ def crop_term(percept: Percept, before: tuple[Array, Array]) -> float:
 
 
 def pose_term(percept: Percept, before: Percept | None, center: Array, transition: LatentTransition) -> float:
-    """KL[Q(p | o) || P(p | p_before, a)]: the latent as seen, against the one before moved by the camera's displacement
-    around the object at `center` [3]; against a standard normal where there is none."""
+    """KL[Q(p | o) || P(p | p_before, a)] in nats: the latent pose that was seen against the predicted one.
+
+    The prediction is the latent pose of the percept `before`, moved by the camera's displacement around the object at
+    `center` [3] (m, world). If there is no percept before, the prediction is a standard normal distribution.
+    """
     seen = percept.latent_mean, percept.latent_std
     if before is None:
         return float(kl_divergence(seen, (0.0, 1.0)))
@@ -73,5 +86,5 @@ def pose_term(percept: Percept, before: Percept | None, center: Array, transitio
 
 
 def likelihood_term(percept: Percept) -> float:
-    """-log P(o_k | p) up to a constant: the reconstruction error of the crop."""
+    """-log P(o_k | p) in nats, up to a constant: the reconstruction error of the crop divided by 2 PIXEL_STD^2."""
     return percept.reconstruction_error / (2 * PIXEL_STD ** 2)

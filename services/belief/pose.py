@@ -1,8 +1,9 @@
-"""From where an object would look like the goal: a posterior over its viewing hemisphere, fused over all views.
+"""From which direction an object would look like the goal image: a posterior that is fused from all views.
 
-Each view's latent pose is moved by every displacement to the cells of a grid; a cell is as likely as the goal's latent
-is under the moved one (paper, equations 2 and 5). Views at different places multiply; their disagreement makes the
-posterior of a nearly symmetric object multi-modal, and new views decide between the modes.
+The directions are the cells of a grid on the hemisphere above the object. For each view, the CCN's transition moves the
+latent pose of the view to every cell. A cell is as likely as the goal's latent pose is under the moved one (paper,
+equations 2 and 5). The likelihoods of views from different places are multiplied. For a nearly symmetric object the
+posterior may have several modes; new views decide between them.
 """
 
 from __future__ import annotations
@@ -28,31 +29,34 @@ from saccade.shared.world.geometry import (
 
 Array = NDArray[np.float64]
 
-OUTLIER = 0.05  # chosen: share of views whose latent says nothing
-NEW_VIEW_RAD = 0.08  # chosen: a view this near to a kept one adds nothing, a little more than a cell of the grid
-BETTER = 1.2  # chosen: unless its quality is higher by this factor
-CERTAIN = 0.03  # chosen: deviation of a log scale that counts as certain, in the quality of a view
-HERE_RAD = 0.25  # chosen: directions that would pass for the goal's, half of what the task allows
-TURNED_RAD = 0.5  # derived: the task's tolerance, for the turn of the image near the pole
-NEAR_RAD = 0.35  # chosen: views this near to the goal's direction say more about it
-NEAR_WEIGHT = 5.0  # chosen: by so much, at most
-SAME_SCALE = 0.3  # chosen: weight of the prior that the goal's range is as measured, against one near view
-MOVED_M = 0.01  # chosen: when the object is believed elsewhere by this much, displacements are measured again
+OUTLIER = 0.05  # chosen: probability that the latent pose of a view says nothing about the goal's direction
+NEW_VIEW_RAD = 0.08  # chosen: two views within this angle count as the same view; a little less than a cell of the grid
+BETTER = 1.2  # chosen: a view replaces the same kept view if its quality is higher by this factor
+CERTAIN = 0.03  # chosen: the quality of a view is its presence / (this + standard deviation of its log scale)
+HERE_RAD = 0.25  # chosen: directions within this angle count as the same direction; half of the task's tolerance
+TURNED_RAD = 0.5  # derived: the task's tolerance for the rotation of the image, which the azimuth changes near the pole
+NEAR_RAD = 0.35  # chosen: views within about this angle of the goal's likeliest direction count more
+NEAR_WEIGHT = 5.0  # chosen: what is added at most to the weight 1 of a view near the goal's likeliest direction
+SAME_SCALE = 0.3  # chosen: weight of the prior that the goal's range is as measured; one near view has at most 1
+MOVED_M = 0.01  # chosen: if the object's position changes by more than this, all displacements are computed again
 
 
 @dataclass(eq=False)
 class Keyframe:
-    """A view that is kept: from where, what the latent was, and its log likelihood over the grid [E, A]."""
+    """A view of the object that is kept, with its log likelihood over the grid of directions [E, A]."""
 
-    eye: Array
-    mean: NDArray[np.float32]
-    quality: float
-    range_m: float  # as the percept has it
+    eye: Array  # position of the camera [3], m, world
+    mean: NDArray[np.float32]  # of the latent pose [L]
+    quality: float  # see CERTAIN
+    range_m: float  # from the percept's scale
     log_likelihood: Array
 
 
 class GoalView:
-    """The posterior of one object."""
+    """The posterior over the directions from which one object looks as in the goal image.
+
+    `goal` is the percept of this object in the goal image.
+    """
 
     def __init__(self, config: BeliefConfig, transition: LatentTransition, goal: Percept):
         self.config, self.transition = config, transition
@@ -61,12 +65,16 @@ class GoalView:
         self.measured_range_m = REFERENCE_RANGE_M / goal.scale
         elevation, azimuth = viewing_grid()
         self.elevation, self.azimuth = (x.ravel() for x in np.meshgrid(elevation, azimuth, indexing="ij"))
-        self.prior = np.zeros((GRID_ELEVATIONS, GRID_AZIMUTHS))  # even in elevation, as goals are drawn (section 4.1)
+        # Uniform in azimuth and elevation, because goals are drawn like this (paper, section 4.1).
+        self.prior = np.zeros((GRID_ELEVATIONS, GRID_AZIMUTHS))
         self.keyframes: list[Keyframe] = []
-        self.center = np.full(3, np.inf)  # where the object was believed last: nowhere yet
+        self.center = np.full(3, np.inf)  # last believed position of the object; none yet
 
     def seen(self, percept: Percept, center: Array) -> None:
-        """Adds a view of the object, believed at `center` [3], unless one like it is kept."""
+        """Adds a view of the object, which is believed to be at `center` [3] (m, world).
+
+        The view is dropped if a kept view from nearly the same direction is about as good.
+        """
         if np.linalg.norm(center - self.center) > MOVED_M:
             self.center = np.array(center)
             for keyframe in self.keyframes:
@@ -86,21 +94,24 @@ class GoalView:
                                        self._likelihood(eye, mean)))
 
     def here(self, percept: Percept) -> float:
-        """Share of the present view's say that falls to the directions around its own."""
+        """Probability, by the present view alone, that the goal image was taken from about this direction."""
         eye = percept.world_from_camera[:3, 3]
         mean = percept.latent_mean
         last = self.keyframes[-1]
         kept = np.array_equal(last.eye, eye) and np.array_equal(last.mean, mean)
         share = np.exp(last.log_likelihood if kept else self._likelihood(eye, mean)).ravel()
         near = direction(self.azimuth, self.elevation) @ unit(eye - self.center) > np.cos(HERE_RAD)
-        # near the pole the azimuth turns the image: only what is turned as seen from here counts
+        # Near the pole a change of azimuth rotates the image. Only directions with about the present rotation count.
         azimuth, elevation, _ = spherical(eye, self.center)
         turned = np.abs(wrap(self.azimuth - azimuth)) < HERE_RAD / max(float(np.cos(elevation)), HERE_RAD)
         upright = (elevation < np.pi / 2 - 3 * HERE_RAD) | (np.abs(wrap(self.azimuth - azimuth)) < TURNED_RAD)
         return float(share[near & turned & upright].sum())
 
     def _likelihood(self, eye: Array, mean: NDArray[np.float32]) -> Array:
-        """log of the share of each cell in one view's say [E, A], with a floor for views that are wrong."""
+        """Log probability of each direction of the grid by one view alone [E, A].
+
+        The probabilities have a lower limit (OUTLIER), because a view may be wrong.
+        """
         azimuth, elevation, _ = spherical(eye, self.center)
         displacement = np.stack([wrap(self.azimuth - azimuth), self.elevation - elevation], axis=-1)
         moved_mean, moved_std = self.transition(mean, displacement)
@@ -110,28 +121,35 @@ class GoalView:
         return np.log(share).reshape(GRID_ELEVATIONS, GRID_AZIMUTHS)
 
     def log_posterior(self) -> Array | None:
-        """Normalised log probabilities [E, A]; None before the first view."""
+        """Log probabilities of the directions of the grid, normalised [E, A]. None before the first view.
+
+        The views are fused twice. The second time, views near the peak of the first result count more.
+        """
         if not self.keyframes:
             return None
         first = self._fuse(np.ones(len(self.keyframes)))
         return self._fuse(1.0 + NEAR_WEIGHT * self._nearness(first))
 
     def _fuse(self, weights: Array) -> Array:
-        # views are not independent, and they share the goal's own error: together they count for a few at most
+        # Views are not independent, and they share the error of the goal's percept: together they count as a few views.
         worth = min(self.config.view_worth, self.config.views_worth / weights.sum())
         total = self.prior + worth * sum(w * k.log_likelihood for w, k in zip(weights, self.keyframes, strict=True))
         total -= total.max()
         return total - np.log(np.exp(total).sum())
 
     def _nearness(self, log_posterior: Array) -> Array:
-        """How near each kept view is to the likeliest direction [views], 1 for the same."""
+        """How near each kept view is to the likeliest direction, from 0 to 1 for the same direction [views]."""
         best = int(np.argmax(log_posterior))
         towards = direction(self.azimuth[best], self.elevation[best])
         cosines = np.array([unit(k.eye - self.center) @ towards for k in self.keyframes])
         return np.exp(-0.5 * (np.arccos(np.clip(cosines, -1.0, 1.0)) / NEAR_RAD) ** 2)
 
     def range_m(self, log_posterior: Array) -> float:
-        """The goal's range: as measured, corrected by what the same networks get wrong on views from about there."""
+        """Range (m) at which the goal image shows the object.
+
+        It is the measured range, corrected by the error that the same networks make in views from about the goal's
+        direction. With `belief.pose=last` it is not corrected.
+        """
         if self.config.pose == "last":
             return self.measured_range_m
         weights = self._nearness(log_posterior)

@@ -18,20 +18,24 @@ Array = NDArray[np.float64]
 
 WORKSPACE_M = np.array([[-0.5, 0.5], [-0.5, 0.5], [0.0, 0.5]])
 VOLUME_M3 = float(np.prod(WORKSPACE_M[:, 1] - WORKSPACE_M[:, 0]))
-MODEL_STD_M = 0.006  # chosen: what no network can know, the box's centre against what is seen of it
-PAPER_ACROSS_M2, PAPER_ALONG_M2 = 0.020, 0.0969  # appendix D, as the published code has them
-CORRELATION = 2.0  # chosen: successive views err alike, so their deviations count this much larger
-OUTLIER = 0.05  # chosen: share of percepts that are of something else, anywhere in the workspace
-FRESH_SHARE = 0.05  # chosen: share of the particles that are drawn anew from each percept, at least
-VAGUE_M = 0.12  # chosen: a cloud wider than this says next to nothing
-BORN_VAGUE = 0.7  # chosen: share of such a cloud that is drawn anew
-MARGIN_PX = 30  # chosen: an object this near to the image's border need not be seen
-MOST_LOG_ODDS = 8.0  # chosen: of presence and absence, so that a belief can still be changed by some views
+MODEL_STD_M = 0.006  # chosen: deviation of the box's centre from the centre of what is seen, which no network can know
+# Variances across and along the ray (paper, appendix D), with the values of the published code.
+PAPER_ACROSS_M2, PAPER_ALONG_M2 = 0.020, 0.0969
+CORRELATION = 2.0  # chosen: factor for a percept's deviations, because successive views have similar errors
+OUTLIER = 0.05  # chosen: probability that a percept is of something else, anywhere in the workspace
+FRESH_SHARE = 0.05  # chosen: at least this share of the particles is drawn anew from each percept
+VAGUE_M = 0.12  # chosen: a particle cloud with a larger deviation than this says almost nothing
+BORN_VAGUE = 0.7  # chosen: share of a cloud wider than VAGUE_M that is drawn anew from a percept
+MARGIN_PX = 30  # chosen: an object nearer than this to the image's border is not expected to be seen
+MOST_LOG_ODDS = 8.0  # chosen: limit of the log odds of presence, so that a few views can still change the belief
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """A percept as a Gaussian in space: mean [3], covariance [3, 3], metres, world."""
+    """A percept as a Gaussian over the object's position (world frame): mean [3] in m, covariance [3, 3] in m^2.
+
+    `range_m` is its distance from the camera, `direction` [3] the unit vector from the camera to it.
+    """
 
     mean: Array
     covariance: Array
@@ -40,8 +44,10 @@ class Evidence:
 
 
 def evidence_of(percept: Percept, covariance: str = "calibrated") -> Evidence:
-    """The Gaussian along the ray: sharp across it, as wide along it as the scale is uncertain; or of the paper's fixed
-    covariance."""
+    """The Gaussian of a percept: narrow across its ray, and along its ray as wide as its scale is uncertain.
+
+    With `covariance="paper"` the covariance is the paper's fixed one (appendix D).
+    """
     camera = percept.world_from_camera
     ray = camera[:3, :3] @ pixel_rays(percept.pixel, percept.intrinsics_px)
     range_m = REFERENCE_RANGE_M / percept.scale
@@ -56,7 +62,7 @@ def evidence_of(percept: Percept, covariance: str = "calibrated") -> Evidence:
 
 @contextmanager
 def _global_state(rng: np.random.Generator) -> Iterator[None]:
-    """filterpy draws from NumPy's global state: lends it ours for the call."""
+    """Seeds NumPy's global random state from `rng` while filterpy draws from it, and restores it afterwards."""
     before = np.random.get_state()
     np.random.seed(int(rng.integers(2 ** 32)))
     try:
@@ -66,13 +72,13 @@ def _global_state(rng: np.random.Generator) -> Iterator[None]:
 
 
 class PositionFilter:
-    """Particles [N, 3] and weights [N] of one object."""
+    """A particle filter over the position of one object: particles [N, 3] (m, world) and weights [N]."""
 
     def __init__(self, config: BeliefConfig, rng: np.random.Generator):
         self.config = config
         self.particles = rng.uniform(WORKSPACE_M[:, 0], WORKSPACE_M[:, 1], (config.particles, 3))
         self.weights = np.full(config.particles, 1.0 / config.particles)
-        self.log_odds = 0.0  # that the object is in the scene at all
+        self.log_odds = 0.0  # log odds that the object is in the scene
 
     @property
     def presence(self) -> float:
@@ -80,8 +86,11 @@ class PositionFilter:
         return float(1.0 / (1.0 + np.exp(-np.clip(self.log_odds, -20, 20))))
 
     def seen(self, percept: Percept, rng: np.random.Generator) -> None:
-        """Positive evidence: particles gain by their density under the percept's Gaussian; some are drawn from it, so
-        that a lost object is found again, by two percepts that agree and not by a single wrong one."""
+        """Updates the particles with a percept that sees the object (positive evidence).
+
+        Particles gain weight by their density under the percept's Gaussian. Some particles are drawn anew from this
+        Gaussian, so that an object that was lost is found again: not by a single wrong percept, but by two that agree.
+        """
         evidence = evidence_of(percept, self.config.covariance)
         factor = np.linalg.cholesky(evidence.covariance)
         born = self.config.born
@@ -93,23 +102,30 @@ class PositionFilter:
         inside = np.all((drawn > WORKSPACE_M[:, 0]) & (drawn < WORKSPACE_M[:, 1]), axis=1)
         self.particles[fresh] = np.where(inside[:, None], drawn, self.particles[fresh])
         likelihood = (1 - born) * (_density(self.particles, evidence, factor) + OUTLIER / VOLUME_M3)
-        self.weights[fresh] = 1.0  # drawn from the percept itself, their share of the posterior is known:
+        # The fresh particles were drawn from the percept itself, so their share of the posterior is known.
+        self.weights[fresh] = 1.0
         likelihood[fresh] = np.where(inside, born / VOLUME_M3 / max(len(fresh), 1), 0.0)
         self._reweigh(likelihood, rng)
         odds = percept.presence / max(1.0 - percept.presence, 1e-3)
         self.log_odds = min(self.log_odds + np.log(max(odds, 1e-3)), MOST_LOG_ODDS)
 
     def visible(self, camera: Array, intrinsics_px: Array, others: list[tuple[Evidence, float]]) -> NDArray[np.bool_]:
-        """Which particles [N] are in view and not behind one of the `others` that are seen (with their radii, m)."""
+        """Which particles [N] are inside the image and not hidden by one of the `others`.
+
+        `camera` is world_from_camera [4, 4]. `others` are the other objects that are seen, with their radii (m).
+        """
         hide = behind if self.config.hidden == "outlines" else beyond_nearest
         return in_view(self.particles, camera, intrinsics_px) & ~hide(self.particles, camera[:3, 3], others)
 
     def expected(self, visible: NDArray[np.bool_]) -> float:
-        """Probability that the object is seen, by the particles that are `visible` [N]."""
+        """Probability that the object is seen in a view in which the particles `visible` [N] are visible."""
         return self.presence * float(self.weights[visible].sum())
 
     def missed(self, visible: NDArray[np.bool_], rng: np.random.Generator) -> None:
-        """Negative evidence: the object is not seen, so the particles that are `visible` [N] lose."""
+        """Updates the particles with an image in which the object is not seen (negative evidence).
+
+        The particles that are `visible` [N] lose weight.
+        """
         share = float(self.weights[visible].sum())
         self._reweigh(np.where(visible, self.config.missed_weight, 1.0), rng)
         unseen = max(1.0 - share * (1.0 - self.config.missed_weight), 1e-3)
@@ -126,32 +142,35 @@ class PositionFilter:
             self.weights = np.full(len(weights), 1.0 / len(weights))
 
     def moments(self) -> tuple[Array, Array]:
-        """Mean [3] and covariance [3, 3] of the cloud."""
+        """Mean [3] (m) and covariance [3, 3] (m^2) of the particle cloud."""
         mean = self.weights @ self.particles
         centred = self.particles - mean
         return mean, (centred * self.weights[:, None]).T @ centred
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
-        """`count` particles [count, 3] drawn by weight, evenly spread over the cloud."""
+        """Draws `count` particles [count, 3] (m) by weight, with systematic sampling."""
         places = (np.arange(count) + rng.random()) / count
         return self.particles[np.minimum(np.searchsorted(np.cumsum(self.weights), places), len(self.weights) - 1)]
 
 
 def _density(points: Array, evidence: Evidence, factor: NDArray[np.floating]) -> Array:
-    """Gaussian density [N], per cubic metre."""
+    """Density of the evidence's Gaussian at points [N, 3], per cubic metre [N]; `factor` is its Cholesky factor."""
     whitened = np.linalg.solve(factor, (points - evidence.mean).T)
     return np.exp(-0.5 * (whitened ** 2).sum(0)) / ((2 * np.pi) ** 1.5 * np.prod(np.diag(factor)))
 
 
 def in_view(points: Array, camera: Array, intrinsics_px: Array) -> NDArray[np.bool_]:
-    """Which points [N, 3] lie well inside the image."""
+    """Which points [N, 3] are in front of the camera and inside the image, at least MARGIN_PX from its border."""
     pixels, depth = project(points, camera, intrinsics_px)
     inside = (pixels > MARGIN_PX) & (pixels < IMAGE_SIZE_PX - MARGIN_PX)
     return inside.all(-1) & (depth > 0.05)
 
 
 def behind(points: Array, eye: Array, seen: list[tuple[Evidence, float]]) -> NDArray[np.bool_]:
-    """Which points [N, 3] an object that is seen may hide from the eye [3]: farther, and within its outline."""
+    """Which points [N, 3] may be hidden from the eye [3] by an object that is seen.
+
+    These are the points that are farther away than the object and within its outline.
+    """
     hidden = np.zeros(len(points), dtype=bool)
     offset = points - eye
     distance = np.linalg.norm(offset, axis=1)

@@ -1,4 +1,4 @@
-"""`python -m saccade.services.camera --config FILE`: a real camera's frames, one a period."""
+"""Runs a real camera, which publishes one frame per period: `python -m saccade.services.camera --config FILE`."""
 
 from saccade.shared.loop.main import main
 

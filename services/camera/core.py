@@ -1,4 +1,4 @@
-"""The core of a real camera: its images with their poses, in the simulator's place."""
+"""The core of the camera service: it publishes real images with their poses, in the place of the simulator."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from saccade.shared.world.images import image_size, read_goal_image, read_image
 from saccade.shared.world.task import start_pose
 
 SERVICE = Service("camera", inputs=(ACTION,), trigger=ACTION, outputs=(FRAME, GOAL))
-WHOLE = 0.995  # of the field of view; what is less is said
+WHOLE = 0.995  # share of the networks' field of view; if the camera covers less, the user is told
 
 
 class Camera:
-    """The images of a source as the networks know them, with INTRINSICS_PX and their poses.
+    """Turns the images of a source into frames like those of the training, with INTRINSICS_PX and their poses.
 
-    They are one episode, the first; a camera that is started again in a run begins another one. Whoever drives it asks
-    for the next frame every `period_s` seconds. Images without a pose are `skipped`. With `loop`
-    the source begins anew when it has ended. `goal_rgb` [480, 480, 3]; without it the agent explores. `notes`: what is
-    assumed, a line each, for the user.
+    All images belong to one episode. A camera that is started again within a run begins another episode. The caller
+    asks for the next frame every `period_s` seconds. Images without a pose are left out and counted in `skipped`. With
+    `loop` the source begins anew when it has ended. `goal_rgb` is the goal image [480, 480, 3]; without it the agent
+    explores. `notes` tells the user what is assumed, one line for each assumption.
     """
 
     episodes = 1
@@ -41,7 +41,7 @@ class Camera:
         self.period_s, self.skipped = source.period_s, 0
 
     def begin(self, run: str, episode: int) -> list[Output]:
-        """The goal and the first frame. Raises SaccadeError where no image has a pose."""
+        """Returns the goal and the first frame. Raises SaccadeError if no image has a pose."""
         self._run, self._episode, self._published, self.skipped = run, episode, 0, 0
         self._first: SourceImage | None = None
         self._images = self._all_images()
@@ -54,8 +54,10 @@ class Camera:
         return [Output(GOAL, goal), *frame]
 
     def next_frame(self) -> list[Output]:
-        """The frame of the next image that has a pose; nothing when there is none. Raises SaccadeError for an image
-        that cannot be read."""
+        """Returns the frame of the next image that has a pose, or nothing if there is no such image any more.
+
+        Raises SaccadeError if an image cannot be read or has another size.
+        """
         for image in self._images:
             self._first, self._last = self._first or image, image
             world_from_camera = self.poses.of(image)
@@ -71,7 +73,7 @@ class Camera:
         return []
 
     def step(self, inputs: Inputs) -> list[Output]:
-        """Nothing: an action is the viewpoint to move to, and this camera is moved by others."""
+        """Ignores the action, because somebody else moves this camera. Returns nothing."""
         return []
 
     def _all_images(self) -> Iterator[SourceImage]:
@@ -81,7 +83,10 @@ class Camera:
 
 
 def build(config: Config) -> Camera:
-    """The camera of a configuration. Raises SaccadeError for what is missing or damaged, before anything runs."""
+    """Creates the camera from a configuration.
+
+    Raises SaccadeError if the source, the poses, the intrinsics or the goal image are missing, damaged or do not fit.
+    """
     camera = config.camera
     if camera.source is None:
         raise SaccadeError("camera.source is not given: give a folder of images, a video file, or a webcam (webcam:0)")
@@ -93,7 +98,11 @@ def build(config: Config) -> Camera:
 
 
 def _goal_rgb(config: Config, virtual_camera: VirtualCamera) -> NDArray[np.uint8] | None:
-    """The goal image, of the camera's own size (and then resampled like its images) or of 480x480 pixels."""
+    """The goal image [480, 480, 3], or None if the agent explores.
+
+    The file has the size of the camera's images, and is then resampled like them, or 480x480 pixels. Raises
+    SaccadeError for another size.
+    """
     path = config.scene.goal_image
     if path is None or config.scene.explore:
         return None
@@ -107,17 +116,19 @@ def _goal_rgb(config: Config, virtual_camera: VirtualCamera) -> NDArray[np.uint8
 
 
 def _notes(config: Config, virtual_camera: VirtualCamera) -> tuple[str, ...]:
+    """Texts for the user, one line each: what is assumed because it is not given, and whether grey is filled in."""
     notes = []
     if config.camera.intrinsics_px is None:
-        notes.append(f"camera.intrinsics_px is not given: the simulator's (focal length {INTRINSICS_PX[0]:.0f} px) are "
-                     f"assumed of the images' central square at {IMAGE_SIZE_PX}x{IMAGE_SIZE_PX} pixels; ranges are as "
-                     "wrong as the focal length")
+        notes.append("camera.intrinsics_px is not given: the central square of each image, resized to "
+                     f"{IMAGE_SIZE_PX}x{IMAGE_SIZE_PX} pixels, is assumed to have the simulator's intrinsics (focal "
+                     f"length {INTRINSICS_PX[0]:.0f} px); if the true focal length differs, ranges are wrong by the "
+                     "same factor")
     if virtual_camera.coverage < WHOLE:
         notes.append(f"the camera covers {virtual_camera.coverage:.0%} of the networks' field of view: the rest is "
-                     "grey, and what is there counts as not seen")
+                     "grey, and objects there count as not seen")
     if config.camera.poses is None:
         x, y, z = start_pose()[:3, 3]
-        notes.append(f"camera.poses is not given: the camera is taken to stand still at ({x:.2f}, {y:.2f}, {z:.2f}) m, "
-                     "looking at the table's centre; positions cannot be fused over views, viewpoints cannot be placed "
-                     "in the world")
+        notes.append(f"camera.poses is not given: the camera is assumed to stand still at ({x:.2f}, {y:.2f}, {z:.2f}) "
+                     "m and to look at the table's centre; if it moves or stands elsewhere, the positions of objects "
+                     "and viewpoints are wrong")
     return tuple(notes)

@@ -1,8 +1,10 @@
-"""Where the camera was at each image: poses from a file of JSON lines or in the TUM trajectory format.
+"""The camera's pose at each image, read from a file of JSON lines or in the TUM trajectory format.
 
-The world is the agent's: metres, z up, table top at z = 0. JSON lines: `{"image": "a.png", "world_from_camera": 4x4}`,
-with "index" (from 0) or "time_s" in place of "image"; a camera that stands still has one line with none of them.
-TUM: `timestamp tx ty tz qx qy qz qw`, the pose of the camera in the world. Blank lines and those with # say nothing.
+Poses are in the agent's world: metres, z up, table top at z = 0.
+JSON lines: `{"image": "a.png", "world_from_camera": 4x4}`, with "index" (from 0) or "time_s" in place of "image". A
+camera that stands still has one line without any of the three.
+TUM: `timestamp tx ty tz qx qy qz qw`, the pose of the camera in the world.
+Blank lines, and lines that begin with #, are ignored.
 """
 
 from __future__ import annotations
@@ -22,38 +24,41 @@ from saccade.services.camera.sources import SourceImage
 from saccade.shared.errors import SaccadeError
 from saccade.shared.world.geometry import Array, pose
 
-Convention = Literal["opengl", "opencv"]  # looks along -z with +y up, or along +z with +y down
-Key = tuple[str, str | int | float | None]  # what is told of a pose, and its value
+Convention = Literal["opengl", "opencv"]  # the camera looks along -z with +y up, or along +z with +y down
+Key = tuple[str, str | int | float | None]  # how a pose is assigned (image, index, time_s or still), and the value
 
-MAX_GAP_S = 1.0  # between two poses further apart nobody knows how the camera went
-HOLD_S = 0.1  # so far from a pose the camera counts as still there
-ORTHONORMAL = 1e-3  # largest error of R^T R: poses are written with four digits or more
-UNIT_QUATERNION = 1e-2
+MAX_GAP_S = 1.0  # poses are not interpolated across a longer gap, because the camera's path there is unknown
+HOLD_S = 0.1  # a pose also holds for images this long before and after it
+ORTHONORMAL = 1e-3  # largest error of R^T R that is accepted: poses are written with four digits or more
+UNIT_QUATERNION = 1e-2  # largest error of a quaternion's length that is accepted
 STILL: Key = ("still", None)
 _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True)
 class Poses:
-    """world_from_camera [4, 4] (OpenGL) by the file name, index or time of an image, or one for all (STILL)."""
+    """Poses world_from_camera [4, 4] (OpenGL) by the file name, the index or the time of an image.
+
+    A camera that stands still has one pose for all images (STILL).
+    """
 
     table: dict[Key, Array]
     name: str = ""
 
     @classmethod
     def still(cls, world_from_camera: Array) -> Poses:
-        """A camera that does not move."""
+        """The poses of a camera that stands still at this pose [4, 4]."""
         return cls({STILL: world_from_camera})
 
     def of(self, image: SourceImage) -> Array | None:
-        """The camera's pose at an image; None if it is not known."""
+        """The camera's pose [4, 4] at an image. None if it is not known."""
         for key in (STILL, ("image", image.name), ("index", image.index)):
             if key in self.table:
                 return self.table[key]
         return self._at(image.time_s)
 
     def end_before(self, image: SourceImage) -> bool:
-        """Whether neither this image nor a later one of the source can have a pose: all are by time, and past."""
+        """Whether neither this image nor a later one can have a pose: all poses are by time, and all are past."""
         times = self._times_s
         return 0 < len(times) == len(self.table) and image.time_s > times[-1] + HOLD_S
 
@@ -65,7 +70,10 @@ class Poses:
         return sorted(value for what, value in self.table if what == kind)
 
     def _at(self, time_s: float) -> Array | None:
-        """Between two poses: position along the line, rotation along the shortest arc."""
+        """The pose [4, 4] at a time. None if there is none near enough.
+
+        Between two poses the position is interpolated on the line and the rotation on the shortest arc.
+        """
         times = self._times_s
         if len(times) == 0:
             return None
@@ -86,9 +94,10 @@ class Poses:
 
 
 def read_poses(path: Path, convention: Convention | None = None) -> Poses:
-    """The poses of a file, brought to OpenGL from `convention` (absent: JSON lines OpenGL, TUM OpenCV).
+    """Reads the poses of a file and converts them from `convention` to OpenGL.
 
-    Raises SaccadeError with file:line for a line that is damaged, has a rotation that is none, or repeats another.
+    Without a convention, JSON lines are OpenGL and TUM trajectories are OpenCV. Raises SaccadeError if the file cannot
+    be read. Raises SaccadeError with file:line if a line is damaged, has no valid rotation, or repeats another line.
     """
     lines = _lines(path)
     is_json = lines[0][1].startswith("{")
@@ -100,7 +109,7 @@ def read_poses(path: Path, convention: Convention | None = None) -> Poses:
             if key in table:
                 raise ValueError(f"a second pose for {key[0]} {key[1]}")
             if table and STILL in (key, *table):
-                raise ValueError("a pose without image, index or time_s holds for all images: no other may be there")
+                raise ValueError("a pose without image, index or time_s holds for all images: give no other pose")
         except (ValueError, OverflowError) as error:
             raise SaccadeError(f"poses {path}:{number}: {error}") from error
         table[key] = world_from_camera @ _OPENCV_FROM_OPENGL if opencv else world_from_camera
@@ -108,7 +117,7 @@ def read_poses(path: Path, convention: Convention | None = None) -> Poses:
 
 
 def _lines(path: Path) -> list[tuple[int, str]]:
-    """The lines that say something, with their numbers."""
+    """The lines that are neither blank nor comments, with their numbers. Raises SaccadeError if there are none."""
     try:
         lines = [(n, line.strip()) for n, line in enumerate(path.read_text().splitlines(), start=1)]
     except OSError as error:
@@ -155,7 +164,7 @@ def _tum_line(line: str) -> tuple[Key, Array]:
 
 
 def rigid(matrix: ArrayLike) -> Array:
-    """A rigid transform [4, 4], its rotation made orthonormal to the last digit. Raises ValueError for another."""
+    """A rigid transform [4, 4] whose rotation is made orthonormal. Raises ValueError if the matrix is not rigid."""
     try:
         transform = np.array(matrix, dtype=np.float64)
     except (TypeError, ValueError):

@@ -1,4 +1,4 @@
-"""Where real images come from: a folder, a video file or a webcam, each image with its index and time."""
+"""Sources of real images: a folder, a video file or a webcam. Each image has an index and a time."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from saccade.shared.world.images import Size, image_size, read_image
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 DEFAULT_RATE_HZ = 10.0
-MAX_RATE_HZ = 1000.0  # beyond it a video's header says nothing
-WHOLE = 0.9  # share of the frames announced; some formats only estimate their number
-RELEASE_S = 1.0  # a webcam's thread is waited for so long
-SILENT_S = 5.0  # a webcam that gives no image for so long gives none any more
+MAX_RATE_HZ = 1000.0  # a higher frame rate in a video's header is not believed
+WHOLE = 0.9  # share of the announced frames that a video must have; some formats only estimate their number
+RELEASE_S = 1.0  # how long to wait for a webcam's thread to end
+SILENT_S = 5.0  # after this time without an image a webcam counts as failed
 
 
 @dataclass(frozen=True)
 class SourceImage:
-    """RGB [H, W, 3], its number from 0, its time in seconds since the source began, its file's name ("" if none)."""
+    """An image: RGB [H, W, 3], number from 0, time in seconds since the source began, file name ("" if none)."""
 
     rgb: NDArray[np.uint8]
     index: int
@@ -42,7 +42,7 @@ class SourceImage:
 
 
 class Source(Protocol):
-    """Images in order; iterating again begins anew. All images have one size."""
+    """Images in order, all of one size. Iterating again begins with the first image."""
 
     name: str
     size_px: Size
@@ -50,14 +50,14 @@ class Source(Protocol):
     endless: bool
 
     def __iter__(self) -> Iterator[SourceImage]:
-        """The images. Raises SaccadeError for one that cannot be read."""
+        """Yields the images. Raises SaccadeError if an image cannot be read."""
 
 
 def open_source(text: str, *, rate_hz: float = DEFAULT_RATE_HZ) -> Source:
-    """A folder of PNG or JPEG images, a video file, or a webcam (`webcam:0`, `/dev/video0`).
+    """Opens a folder of PNG or JPEG images, a video file, or a webcam (`webcam:0`, `/dev/video0`).
 
-    `rate_hz`: images a second of a folder and of a webcam; a video has its own. Raises SaccadeError for what is not
-    there or cannot be read.
+    `rate_hz` is the number of images per second from a folder or a webcam; a video has its own rate. Raises
+    SaccadeError if the source does not exist or cannot be read.
     """
     number = webcam_number(text)
     if number is not None:
@@ -74,18 +74,21 @@ def open_source(text: str, *, rate_hz: float = DEFAULT_RATE_HZ) -> Source:
 
 
 def webcam_number(text: str) -> int | None:
-    """0 of `webcam:0` and of `/dev/video0`; None of any other text."""
+    """The number of a webcam: 0 for `webcam:0` and for `/dev/video0`. None for any other text."""
     match = re.fullmatch(r"(?:webcam:|/dev/video)([0-9]+)", text)
     return int(match[1]) if match else None
 
 
 def absolute(text: str) -> str:
-    """The source's text, meaning the same in every working directory."""
+    """The source as a text that means the same in every working directory."""
     return text if webcam_number(text) is not None else str(Path(text).resolve())
 
 
 class Folder:
-    """The PNG and JPEG files of a folder, sorted by name with numbers in their order; hidden files are not seen."""
+    """The PNG and JPEG files of a folder, without hidden files, sorted by name (`2.png` comes before `10.png`).
+
+    Raises SaccadeError if the folder or an image cannot be read, if it has no image, or if the sizes differ.
+    """
 
     endless = False
 
@@ -111,19 +114,22 @@ def _natural(path: Path) -> tuple[list[str | int], str]:
 
 
 def _common_size(paths: list[Path]) -> Size:
-    """The size of all images. One camera has one size: where sizes differ no intrinsics hold for all."""
+    """The common size of all images. Raises SaccadeError if sizes differ: no intrinsics would hold for all images."""
     first, *others = paths
     size = image_size(first)
     for path in others:
         other = image_size(path)
         if other != size:
             raise SaccadeError(f"image {path} is {other[0]}x{other[1]} pixels, {first.name} is {size[0]}x{size[1]}: "
-                               "the images of a folder must come from one camera, upright or on its side alike")
+                               "the images of a folder must come from one camera, all in the same orientation")
     return size
 
 
 class Video:
-    """A video file; times are those of its frames, counted with its frame rate where they have none."""
+    """A video file. Each image has the time of its frame, or a time by the frame rate if the frame has none.
+
+    Raises SaccadeError if OpenCV is not installed, or if the file is damaged or of an unknown format.
+    """
 
     endless = False
 
@@ -165,7 +171,10 @@ class Video:
 
 
 class Webcam:
-    """A camera of this machine: always its newest image, with the time since the first by `clock` (seconds)."""
+    """A camera of this machine. It always gives its newest image, with the time since the first by `clock` (seconds).
+
+    Raises SaccadeError if OpenCV is not installed, or if the camera does not open or gives no image.
+    """
 
     endless = True
 
@@ -210,7 +219,10 @@ class Webcam:
 
 
 def _keep_newest(capture: Any, clock: Callable[[], float], newest: queue.Queue, stop: threading.Event) -> None:
-    """Drivers queue images: read as they come, or a slow consumer is shown the past. None says that no more come."""
+    """Reads the camera's images as they come and keeps only the newest in the queue. None means that no more come.
+
+    Drivers queue images, so a slow reader would otherwise get old ones.
+    """
 
     def put(item: tuple[float, NDArray[np.uint8]] | None) -> None:
         with suppress(queue.Empty):
@@ -229,15 +241,15 @@ def _keep_newest(capture: Any, clock: Callable[[], float], newest: queue.Queue, 
 
 
 def _cv2() -> Any:
-    """OpenCV, loaded when the first video or webcam is opened. Raises SaccadeError where it is not installed."""
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # quiet: what fails is said in one line of ours
+    """OpenCV, imported when the first video or webcam is opened. Raises SaccadeError if it is not installed."""
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # quiet, because our own errors say what fails in one line
     try:
         import cv2
     except ImportError as error:
         raise SaccadeError(f"videos and webcams need OpenCV ({error}): pip install opencv-python-headless, or give a "
                            "folder of images") from error
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    cv2.setNumThreads(1)  # like every service
+    cv2.setNumThreads(1)  # every service uses one thread
     return cv2
 
 

@@ -1,8 +1,8 @@
-"""The camera that the networks were trained with, put in the place of the real one.
+"""Turns images of a real camera into images that the camera of the training would have seen.
 
-scale = 0.40 m / range is learned at the training's focal length, so another camera's images would give wrong ranges.
-Two pinhole cameras with one centre see the same rays: their images differ by a homography, K' K^-1, whatever the scene.
-With equal attitude and no skew that is a scale and a shift of each axis.
+The networks learned scale = 0.40 m / range at one focal length. Unchanged images of another camera would give wrong
+ranges. Two pinhole cameras with the same centre see the same rays, so their images differ by a homography, K' K^-1,
+for any scene. If both have the same attitude and no skew, this homography is a scale and a shift of each axis.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from saccade.shared.world.images import Size
 
 Intrinsics = tuple[float, float, float, float]  # fx, fy, cx, cy in pixels
 
-MIN_COVERAGE = 0.2  # of the networks' field of view; below it most of what they see would be made up
-CENTRAL = (0.3, 0.7)  # where a principal point lies, as a share of the image's side
-FILL = 128  # grey: the image's edge, drawn out, makes objects there larger and others appear
+MIN_COVERAGE = 0.2  # smallest share of the networks' field of view that images must cover; the rest is filled with grey
+CENTRAL = (0.3, 0.7)  # limits of the principal point, as shares of the image's side
+FILL = 128  # grey; repeating the image's border instead would enlarge objects there and make others appear
 _ROUNDING_PX = 1e-6
 
 
 @dataclass(frozen=True)
 class _Axis:
-    """Output pixels [first, last) of one axis show the image from `start` to `end` (pixels of the image)."""
+    """One axis of the mapping: output pixels [first, last) show the image from `start` to `end` (image pixels)."""
 
     first: int
     last: int
@@ -37,27 +37,31 @@ class _Axis:
 
 
 def _axis(length_px: int, focal: float, center: float, trained_focal: float, trained_center: float) -> _Axis:
-    step = focal / trained_focal
-    origin = center - trained_center * step  # of the output, in pixels of the image
+    step = focal / trained_focal  # image pixels per output pixel
+    origin = center - trained_center * step  # the start of the output, in image pixels
     first = max(0, int(np.ceil(-origin / step - _ROUNDING_PX)))
     last = min(IMAGE_SIZE_PX, int(np.floor((length_px - origin) / step + _ROUNDING_PX)))
     return _Axis(first, last, max(0.0, origin + first * step), min(float(length_px), origin + last * step))
 
 
 def assumed_intrinsics(size_px: Size) -> Intrinsics:
-    """Those of images of this size whose central square, at 480x480 pixels, has the intrinsics of the training."""
+    """The intrinsics of images of this size (width, height) if their central square is an image of the training.
+
+    The central square, resized to 480x480 pixels, then has the intrinsics of the training.
+    """
     side = min(size_px)
     fx, fy, cx, cy = (x * side / IMAGE_SIZE_PX for x in INTRINSICS_PX)
     return fx, fy, cx + (size_px[0] - side) / 2, cy + (size_px[1] - side) / 2
 
 
 class VirtualCamera:
-    """Turns images of `size_px` into those that a camera with INTRINSICS_PX would see from the same pose.
+    """Turns images of `size_px` (width, height) into images of a camera with INTRINSICS_PX at the same pose.
 
-    `intrinsics_px` (fx, fy, cx, cy) are the real camera's, without lens distortion; cx, cy from the corner of the first
-    pixel (OpenCV counts from its centre: half a pixel less). Absent, those of `assumed_intrinsics`, which makes it a
-    central square crop. What the real camera does not see is grey; `coverage` is the share of the output that it does
-    see. Raises SaccadeError for intrinsics that cannot be those of images of this size.
+    `intrinsics_px` (fx, fy, cx, cy) are those of the real camera, without lens distortion. cx and cy are counted from
+    the corner of the first pixel; OpenCV counts from its centre, so its values are half a pixel less. Without
+    intrinsics those of `assumed_intrinsics` are used, and the output is the central square. Pixels that the real camera
+    does not see are grey; `coverage` is the share of pixels that it sees. Raises SaccadeError if the intrinsics cannot
+    be those of images of this size, or if the images cover too little of the networks' field of view.
     """
 
     def __init__(self, size_px: Size, intrinsics_px: Sequence[float] | None = None):
@@ -79,7 +83,7 @@ class VirtualCamera:
                                f"networks' field of view, less than {MIN_COVERAGE:.0%}: {need}, or use a wider lens")
 
     def see(self, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The image [480, 480, 3] with INTRINSICS_PX. Raises SaccadeError where `rgb` [H, W, 3] has another size."""
+        """The image [480, 480, 3] with INTRINSICS_PX. Raises SaccadeError if `rgb` [H, W, 3] has another size."""
         if rgb.shape != (*self.size_px[::-1], 3):
             raise SaccadeError(f"an image of shape {list(rgb.shape)} among images of {self.size_px[0]}x"
                                f"{self.size_px[1]} pixels: all must come from one camera")

@@ -1,4 +1,4 @@
-"""`python -m saccade.services.evaluator --config FILE`: the truth in, results out."""
+"""Runs the evaluator, which turns the truth into results: `python -m saccade.services.evaluator --config FILE`."""
 
 from saccade.shared.loop.main import main
 

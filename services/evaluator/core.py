@@ -1,4 +1,4 @@
-"""The evaluator's core: the truth in, one result an episode out."""
+"""The core of the evaluator: it receives the simulator's truth and gives one result per episode."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ SERVICE = Service("evaluator", inputs=(TRUTH,), trigger=TRUTH, outputs=(RESULT,)
 
 
 class Evaluator:
-    """Says how an episode ended, by the paper's measures (section 4.2), when its last truth arrives."""
+    """Gives the result of an episode when the episode's last truth arrives, by the paper's measures (section 4.2)."""
 
     def begin(self, run: str, episode: int) -> list[Output]:
-        """Nothing to forget: the last truth says it all."""
+        """Does nothing, because the last truth of an episode is enough for its result. Nothing is published."""
         return []
 
     def step(self, inputs: Inputs) -> list[Output]:
-        """The result, once the episode is done."""
+        """Returns the result if the episode is over, otherwise nothing."""
         truth: Truth = inputs["truth"]
         return [Output(RESULT, result_of(truth))] if truth.done else []
 
 
 def result_of(truth: Truth) -> Result:
-    """The result of an episode of which `truth` is the last; errors are those of the last camera position."""
+    """The result of an episode whose last truth is `truth`. The errors are those of the last camera position."""
     azimuth, elevation, distance = errors(truth.world_from_camera[:3, 3], truth.goal_world_from_camera[:3, 3],
                                           truth.target_center_m)
     return Result(run=truth.run, episode=truth.episode, step=truth.step, scene=truth.scene, target=truth.target,
@@ -35,5 +35,5 @@ def result_of(truth: Truth) -> Result:
 
 
 def build(config: Config) -> Evaluator:
-    """The evaluator; nothing about it is configured."""
+    """Creates the evaluator. It uses no key of the configuration."""
     return Evaluator()

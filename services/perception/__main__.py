@@ -1,4 +1,4 @@
-"""`python -m saccade.services.perception --config FILE`: frames and goals in, percepts out."""
+"""Runs perception, which turns frames into percepts: `python -m saccade.services.perception --config FILE`."""
 
 from saccade.shared.loop.main import main
 

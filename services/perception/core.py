@@ -1,4 +1,4 @@
-"""SceneCCN: from an image to one percept per object (paper, section 3.2). All objects are evaluated together."""
+"""SceneCCN: from an image to one percept per object (paper, section 3.2). The networks of all objects run together."""
 
 from __future__ import annotations
 
@@ -26,7 +26,11 @@ SERVICE = Service("perception", inputs=(FRAME, GOAL), trigger=FRAME, outputs=(PE
 
 
 class SceneCCN:
-    """The networks of K objects and how they work together."""
+    """The networks of K objects, and how they work together.
+
+    `passes` says how often the crop of each object is cut; every pass after the first uses the correction of the
+    identity network. Raises SaccadeError if the weights lack an object, are damaged, or have another architecture.
+    """
 
     def __init__(self, weights: Weights, names: tuple[str, ...], passes: int = 2):
         self.cards = weights.cards_of(names)
@@ -40,7 +44,7 @@ class SceneCCN:
 
     @torch.inference_mode()
     def see(self, rgb: NDArray[np.uint8], intrinsics_px: ArrayLike, up: ArrayLike) -> Seen:
-        """Infers all objects from an image [H, W, 3]; `up` [3]: which way is up, in the camera's frame."""
+        """Infers all objects from an image [H, W, 3]. `up` [3] is the direction of up in the camera's frame."""
         image = torch.from_numpy(np.array(rgb)).permute(2, 0, 1).float() / 255.0
         small = F.interpolate(image[None], size=(INPUT_PX, INPUT_PX), mode="area")
         masks, vote_logits, votes = (x[0, self.rows] for x in self.extraction(small))
@@ -63,31 +67,34 @@ class SceneCCN:
 
 
 def model_of(weights: Weights, names: tuple[str, ...], passes: int) -> SceneCCN | PaperSceneCCN:
-    """The networks of the weights' architecture."""
+    """Creates the networks of the architecture that the weights have. Raises SaccadeError as the networks do."""
     if weights.architecture == "paper":
         return PaperSceneCCN(weights, names)
     return SceneCCN(weights, names, passes)
 
 
 class Perception:
-    """Frames in, percepts out; the goal image once per episode by the same networks."""
+    """Turns frames into percepts. Once per episode it does the same with the goal image, with the same networks."""
 
     def __init__(self, config: Config, names: tuple[str, ...]):
         self._weights, self._passes = Weights(config.weights), config.perception.passes
         self.share(names)
 
     def share(self, names: tuple[str, ...]) -> None:
-        """Answers for these objects from now on."""
+        """From now on this copy of the service publishes the percepts of these objects; there may be none.
+
+        Raises SaccadeError if the weights do not serve them.
+        """
         self.names, self.goal_told = names, False
         self.model = model_of(self._weights, names, self._passes) if names else None
 
     def begin(self, run: str, episode: int) -> Iterable[Output]:
-        """Nothing is kept from frame to frame."""
+        """Starts an episode. Percepts depend on one image alone, so there is nothing else to reset."""
         self.goal_told = False
         return ()
 
     def step(self, inputs: Inputs) -> Iterable[Output]:
-        """The goal's percepts at the first step of an episode, then the frame's."""
+        """Yields the percepts of the frame. At the first step of an episode it yields those of the goal image first."""
         model = self.model
         if model is None:
             return
@@ -101,6 +108,7 @@ class Perception:
             yield Output(PERCEPT, percept(frame, name, seen, k, frame.world_from_camera), name)
 
     def _goal(self, model: SceneCCN | PaperSceneCCN, goal: Goal) -> Iterable[Output]:
+        """The percepts of the goal image. Without a goal image the presence of every object is 0."""
         if goal.rgb is None:
             blank = np.zeros((480, 480, 3), dtype=np.uint8)
             seen = model.see(blank, goal.intrinsics_px, (0.0, 1.0, 0.0))
@@ -112,7 +120,7 @@ class Perception:
 
 
 def percept(source: Frame | Goal, name: str, seen: Seen, k: int, world_from_camera: NDArray) -> Percept:
-    """The message of one object."""
+    """The percept message of object `name`, which is number `k` in `seen`."""
     return Percept(
         run=source.run, episode=source.episode, step=source.step, object=name, presence=float(seen.presence[k]),
         pixel=seen.pixel[k], pixel_std=float(seen.pixel_std[k]), scale=float(seen.scale[k]),
@@ -122,5 +130,5 @@ def percept(source: Frame | Goal, name: str, seen: Seen, k: int, world_from_came
 
 
 def build(config: Config) -> Perception:
-    """The core for a run's configuration."""
+    """Creates the core from a run's configuration. Raises SaccadeError if the weights do not serve its objects."""
     return Perception(config, config.names)

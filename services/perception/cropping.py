@@ -1,4 +1,4 @@
-"""The spatial transformer: cuts objects out of the image as a camera that looks straight at them would see them."""
+"""The spatial transformer: it cuts objects out of the image as a camera that looks straight at them would see them."""
 
 from __future__ import annotations
 
@@ -11,12 +11,15 @@ from torch import Tensor
 from saccade.shared.world.geometry import pixel_rays
 from saccade.shared.world.windows import CROP_PX, Window, upright
 
-_FINE_PX = 2 * CROP_PX  # sampled at twice the crop's resolution, then averaged
-_LEVELS = 3  # of the image pyramid: 480, 240, 120
+_FINE_PX = 2 * CROP_PX  # crops are sampled at twice their resolution and then averaged
+_LEVELS = 3  # levels of the image pyramid: 480, 240 and 120 pixels
 
 
 class Cropper:
-    """Cuts windows out of one image [3, H, W] and the masks [K, h, w] of its objects."""
+    """Cuts crop windows out of one image [3, H, W] and the masks [K, h, w] of its objects.
+
+    `up` [3] is the direction of up in the camera's frame.
+    """
 
     def __init__(self, image: Tensor, masks: Tensor, intrinsics_px: ArrayLike, up: ArrayLike):
         self.size = image.shape[-1]
@@ -27,7 +30,7 @@ class Cropper:
         self.intrinsics_px = np.asarray(intrinsics_px, dtype=np.float64)
 
     def cut(self, window: Window) -> tuple[Tensor, Tensor]:
-        """Crops [K, 3, 64, 64] and their masks [K, 1, 64, 64]; what is outside the image is black and unmasked."""
+        """Crops [K, 3, 64, 64] and their masks [K, 1, 64, 64]. Outside the image the crop is black and the mask 0."""
         pixels = window.pixels_of(_FINE_PX, self.intrinsics_px, self.up)
         grid = torch.as_tensor(pixels / self.size * 2 - 1, dtype=torch.float32)
         fx = self.intrinsics_px[0]
@@ -42,7 +45,7 @@ class Cropper:
         return crops, F.avg_pool2d(masks, 2)
 
     def corrected(self, window: Window, correction: ArrayLike) -> Window:
-        """Windows moved by corrections [K, 3]: (du, dv) in crop sides, log of the scale's ratio."""
+        """The windows, changed by corrections [K, 3]: shift (du, dv) in crop sides and log of the scale's ratio."""
         fx, fy, cx, cy = self.intrinsics_px
         correction = np.asarray(correction, dtype=np.float64)
         rotation = upright(pixel_rays(window.pixels, self.intrinsics_px), self.up)

@@ -1,7 +1,7 @@
-"""Networks that find the objects: extraction (mask, centre, scale) in the image, identity on a crop.
+"""Networks that find the objects: the extraction network looks at the whole image, the identity network at a crop.
 
-Both follow the paper's tables in role: a mask network, a spatial transformer that says where and how large, and an
-identity network that says whether the object is there.
+They have the roles of the networks in the paper's tables: a mask network, a spatial transformer network that gives
+centre and scale, and an identity network that says whether the object is there.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from torch import Tensor, nn
 
 from saccade.shared.model.generative_model import conv_stack
 
-INPUT_PX = 120  # side of the image that extraction sees
-MASK_PX = 60
-CELLS = 30  # side of the grid of votes
+INPUT_PX = 120  # side of the image that the extraction network sees
+MASK_PX = 60  # side of its masks
+CELLS = 30  # side of its grid of votes
 
 
 def _block(channels_in: int, channels_out: int, stride: int = 1, dilation: int = 1) -> nn.Sequential:
@@ -23,10 +23,11 @@ def _block(channels_in: int, channels_out: int, stride: int = 1, dilation: int =
 
 
 class Extraction(nn.Module):
-    """Image [B, 3, 120, 120] -> for K objects masks and votes for centre and scale.
+    """The extraction network: image [B, 3, 120, 120] -> masks of K objects, and votes for their centre and scale.
 
     Returns mask logits [B, K, 60, 60] and, on a grid of 30x30 cells, vote logits [B, K, 30, 30] and votes
-    [B, K, 3, 30, 30]: offsets (du, dv) from the cell's centre in image widths, and log(scale).
+    [B, K, 3, 30, 30]. A vote is the offset (du, dv) of the object's centre from the cell's centre in image widths, and
+    log(scale).
     """
 
     def __init__(self, count: int):
@@ -52,8 +53,11 @@ class Extraction(nn.Module):
 
 
 def tally(vote_logits: Tensor, votes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Counts the votes: [..., 30, 30] logits, [..., 3, 30, 30] votes -> presence logit [...], centre (u, v) in image
-    widths [..., 2], log(scale) [...]. The weight of a cell is its probability of seeing the object."""
+    """Averages the votes of the cells: vote logits [..., 30, 30] and votes [..., 3, 30, 30].
+
+    Returns the presence logit [...], the centre (u, v) in image widths [..., 2] and log(scale) [...]. A cell counts
+    more if it sees the object with a higher probability. The presence logit is the mean of the three highest logits.
+    """
     cells = (torch.arange(CELLS, device=votes.device, dtype=votes.dtype) + 0.5) / CELLS
     u = votes[..., 0, :, :] + cells
     v = votes[..., 1, :, :] + cells[:, None]
@@ -64,9 +68,10 @@ def tally(vote_logits: Tensor, votes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 class Identity(nn.Module):
-    """Crop and mask [B, 4, 64, 64] -> presence logit [B], correction [B, 3], its log standard deviation [B, 3].
+    """The identity network: crop and mask [B, 4, 64, 64] -> presence logit [B], correction [B, 3], its log deviation.
 
-    The correction (du, dv in crop sides, log of the scale's ratio) says how far the object is off the crop's centre.
+    The correction is the offset of the object from the crop's centre (du, dv, in crop sides) and the log of the ratio
+    of its scale to the crop's. The log standard deviation of the correction has the shape [B, 3].
     """
 
     def __init__(self, width: int = 2):

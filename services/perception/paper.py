@@ -1,7 +1,8 @@
-"""The paper's own networks (appendix C): what "architecture": "paper" in the weights' manifest stands for.
+"""The paper's own networks (appendix C). They are used if the manifest of the weights says "architecture": "paper".
 
-Each object has all of its own: a mask network, a spatial transformer network on the masked image, an identity network
-and a CCN on the crop. The crop is as the paper's: an affine cut of the masked image, on one scale for all objects.
+Each object has its own networks: a mask network, a spatial transformer network on the masked image, and an identity
+network and a CCN on the crop. The crop is an affine cut of the masked image, with one scale for all objects, as in the
+paper.
 """
 
 from __future__ import annotations
@@ -18,24 +19,26 @@ from saccade.shared.model.weights import Weights
 from saccade.shared.world.geometry import IMAGE_SIZE_PX, INTRINSICS_PX, REFERENCE_RANGE_M
 from saccade.shared.world.windows import CROP_PX
 
-MASK_PX, WHERE_PX = 64, 32  # sides of what the mask network and the spatial transformer network see
-CANVAS_PX = 120  # images at least this large are cut with several samples per crop pixel
-MEDIAN_PX = 5
+MASK_PX, WHERE_PX = 64, 32  # sides of the images that the mask network and the spatial transformer network see
+CANVAS_PX = 120  # the number of samples per crop pixel is the image's side divided by this, rounded, at least 1
+MEDIAN_PX = 5  # side of the median filter on the mask
 START = (1 / 1.0 - 0.2) / 3.8  # h of scale 1: an untrained spatial transformer cuts out the whole image
-CROP_SIDE_M = REFERENCE_RANGE_M * IMAGE_SIZE_PX / INTRINSICS_PX[0]  # what the image covers at 0.40 m
-# Standard deviations of a percept where the manifest gives none, common to all objects as the paper's covariance is.
+CROP_SIDE_M = REFERENCE_RANGE_M * IMAGE_SIZE_PX / INTRINSICS_PX[0]  # the width that the image covers at 0.40 m
+# Standard deviations of a percept if the manifest gives none. They are the same for all objects, as in the paper.
 PIXEL_STD, LOG_SCALE_STD = 20.0, 0.15
 
 
 def median_pool(image: Tensor, side: int) -> Tensor:
-    """The median over side x side pixels around each of [B, 1, H, W]; the image is mirrored at its border."""
+    """Median filter of images [B, 1, H, W], over side x side pixels. The image is mirrored at its border."""
     around = F.pad(image, [side // 2] * 4, mode="reflect")
     return F.unfold(around, side).median(dim=1).values.view(image.shape)
 
 
 def spatial_transform(image: Tensor, center: Tensor, scale: Tensor) -> Tensor:
-    """The squares around `center` [B, 2] (image in [-1, 1]), `scale` [B] images wide, cut out of [B, C, H, H]:
-    [B, C, 64, 64]; black beyond the image."""
+    """Cuts squares out of images [B, C, H, H] and returns crops [B, C, 64, 64]. They are black outside the image.
+
+    `center` [B, 2] is the centre of each square, with the image in [-1, 1]; `scale` [B] is its side in image widths.
+    """
     factor = max(1, round(image.shape[-1] / CANVAS_PX))
     fine = factor * CROP_PX
     axis = (torch.arange(fine, device=image.device) + 0.5) / fine * 2 - 1
@@ -45,7 +48,7 @@ def spatial_transform(image: Tensor, center: Tensor, scale: Tensor) -> Tensor:
 
 
 class MaskNetwork(nn.Module):
-    """alpha: image [B, 3, H, H] -> which pixels are of the object [B, 1, H, H], in (0, 1)."""
+    """The mask network alpha: image [B, 3, H, H] -> probability that each pixel shows the object [B, 1, H, H]."""
 
     def __init__(self):
         super().__init__()
@@ -60,7 +63,10 @@ class MaskNetwork(nn.Module):
 
 
 class SpatialTransformer(nn.Module):
-    """Masked image [B, 3, H, H] -> centre [B, 2] (image in [-1, 1]) and scale [B] (0.40 m / range) of the object."""
+    """The spatial transformer network: masked image [B, 3, H, H] -> centre [B, 2] and scale [B] of the object.
+
+    The image covers [-1, 1]; the scale is 0.40 m / range.
+    """
 
     def __init__(self):
         super().__init__()
@@ -75,13 +81,18 @@ class SpatialTransformer(nn.Module):
     def forward(self, masked: Tensor) -> tuple[Tensor, Tensor]:
         small = F.interpolate(masked, size=(WHERE_PX, WHERE_PX), mode="area")
         center, h = self.layers(small).float().split([2, 1], dim=-1)
-        h = h + (h.clamp(min=0.0) - h).detach()  # ELU reaches below the formula's pole: held there, free to come back
+        # The ELU can reach below the pole of the formula. h is clipped at 0, but its gradient is kept, so that it can
+        # grow again.
+        h = h + (h.clamp(min=0.0) - h).detach()
         return center, 1 / (3.8 * h.squeeze(-1) + 0.2)
 
 
 class PaperExtraction(nn.Module):
-    """What phase 2 trains for one object. Image [B, 3, H, H] -> mask [B, 1, H, H], centre [B, 2] (image in [-1, 1]),
-    scale [B], masked crop and its mask [B, 4, 64, 64], presence logit [B]."""
+    """The networks of one object that phase 2 of the training trains: mask, spatial transformer and identity.
+
+    Image [B, 3, H, H] -> mask [B, 1, H, H], centre [B, 2] (the image covers [-1, 1]), scale [B], masked crop with its
+    mask [B, 4, 64, 64], presence logit [B].
+    """
 
     def __init__(self):
         super().__init__()
@@ -96,7 +107,10 @@ class PaperExtraction(nn.Module):
 
 
 class PaperSceneCCN:
-    """The paper's networks of K objects, evaluated together; `one_by_one` takes the slow way, for comparison."""
+    """The paper's networks of K objects, evaluated together; with `one_by_one` in a slow loop, for comparison.
+
+    Raises SaccadeError if the weights lack an object, are damaged, or have another architecture.
+    """
 
     def __init__(self, weights: Weights, names: tuple[str, ...], *, one_by_one: bool = False):
         self.cards = weights.cards_of(names)
@@ -111,7 +125,7 @@ class PaperSceneCCN:
 
     @torch.inference_mode()
     def see(self, rgb: NDArray[np.uint8], intrinsics_px: ArrayLike, up: ArrayLike) -> Seen:
-        """Infers all objects from an image [H, H, 3]. The paper's crops neither know the camera nor which way is up."""
+        """Infers all objects from an image [H, H, 3]. The paper's crops use neither intrinsics nor `up`."""
         image = torch.from_numpy(np.array(rgb)).permute(2, 0, 1).float() / 255.0
         everyone = image.expand(len(self.cards), 1, -1, -1, -1)
         whole, center, scale, crops, logit = (x[:, 0] for x in self.extraction(everyone))

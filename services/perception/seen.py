@@ -1,4 +1,4 @@
-"""What perception makes of one image, whichever the networks."""
+"""What perception infers from one image, with any of the two architectures of the networks."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from numpy.typing import NDArray
 
 
 def bits(masks: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """Masks [K, M, M], their rows packed into bytes [K, M, B]."""
+    """Packs masks [K, M, M] row by row into bytes [K, M, B]."""
     return np.packbits(masks, axis=-1)
 
 
 @dataclass(frozen=True)
 class Seen:
-    """What the networks made of one image, for K objects: see `Percept` for the units."""
+    """What the networks inferred about K objects from one image. `Percept` describes the fields and their units."""
 
-    presence: NDArray[np.float64]
-    pixel: NDArray[np.float64]
-    pixel_std: NDArray[np.float64]
-    scale: NDArray[np.float64]
-    log_scale_std: NDArray[np.float64]
-    latent_mean: NDArray[np.float32]
-    latent_std: NDArray[np.float32]
-    reconstruction_error: NDArray[np.float64]
-    mask_bits: NDArray[np.uint8]
+    presence: NDArray[np.float64]  # [K]
+    pixel: NDArray[np.float64]  # [K, 2]
+    pixel_std: NDArray[np.float64]  # [K]
+    scale: NDArray[np.float64]  # [K]
+    log_scale_std: NDArray[np.float64]  # [K]
+    latent_mean: NDArray[np.float32]  # [K, L]
+    latent_std: NDArray[np.float32]  # [K, L]
+    reconstruction_error: NDArray[np.float64]  # [K]
+    mask_bits: NDArray[np.uint8]  # [K, M, B], see `bits`

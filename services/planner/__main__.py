@@ -1,4 +1,4 @@
-"""`python -m saccade.services.planner --config FILE`: beliefs in, plans and actions out."""
+"""Runs the planner, which turns beliefs into plans and actions: `python -m saccade.services.planner --config FILE`."""
 
 from saccade.shared.loop.main import main
 

@@ -1,8 +1,8 @@
-"""Chooses viewpoints by minimising expected free energy and moves the camera there in short steps (paper, section 3.3).
+"""Chooses viewpoints with minimal expected free energy and moves there in short steps (paper, section 3.3).
 
-Candidates are drawn by importance: mostly views of where the target is believed to be, from where the goal would look
-as it does. The viewpoint is chosen anew every few steps or on arrival; on arrival at the believed goal the agent says
-so, and goes on to the next likely view should it still be asked to act.
+The planner draws candidate viewpoints. Most of them look at the believed position of the target, from directions from
+which it would look as in the goal image. The viewpoint is chosen anew every few steps and on arrival. When the camera
+arrives at the believed goal, the agent says so. If it is still asked to act, it moves on to the next likely viewpoint.
 """
 
 from __future__ import annotations
@@ -36,28 +36,31 @@ from saccade.shared.world.task import LOWER_M, UPPER_M, Spheres, clip, spheres_a
 
 SERVICE = Service("planner", inputs=(BELIEF, GOAL_PERCEPT), trigger=BELIEF, outputs=(PLAN, ACTION))
 
-FOUND_M = 0.06  # chosen: deviation of the position below which the target counts as found
-KNOWN_M = 0.10  # chosen: objects less certain than this are no obstacle yet
-ARRIVED_M = 0.01  # chosen: the camera has arrived within this distance of its viewpoint
-ARRIVED_RAD = 0.05  # chosen: and within this angle
-STUCK_M = 0.002  # chosen: a camera that moves less than this is as near as it can be
-TURN_M = 0.10  # chosen: from here on the camera turns as planned; before, it keeps looking at what it is about
-NEARER = 0.3  # chosen: nats that a metre of way costs, among search viewpoints that tell the same
-SPREAD_M = 0.10  # from the published code: deviation of the candidates' ranges around the goal's
-CELL_RAD = 0.045  # derived: half a cell of the viewing grid, over which a candidate's direction is spread
-SPREAD = 0.02  # chosen: relative deviation of the range of candidates that are drawn from the goal posterior
-VISITED_M = 0.05  # chosen: how far a view that turned out not to be the goal's speaks for its neighbours
-VISITED_RAD = 0.35  # chosen: the same for their attitude
-VISITED_COST = 6.0  # chosen: nats that such a view costs
-DOUBT_LIMIT = 2.5  # chosen: the goal posterior is softened by no more than this power
-SURE = 0.6  # chosen: probability that this is the goal's view, above which the agent says so
-PEAK_ROWS = 2  # chosen: the posterior's peak is averaged over so many cells of elevation to each side
-PEAK_COLUMNS = 4  # chosen: and over so many cells of azimuth
-PUBLISHED = 64  # candidates that a plan tells of; changes nothing that the agent does
+FOUND_M = 0.06  # chosen: the target counts as found if the deviation of its position is below this
+KNOWN_M = 0.10  # chosen: an object becomes an obstacle if the deviation of its position is below this
+ARRIVED_M = 0.01  # chosen: the camera has arrived if it is within this distance of its viewpoint and within ARRIVED_RAD
+ARRIVED_RAD = 0.05  # chosen: the camera has arrived if it is within this angle of its viewpoint and within ARRIVED_M
+STUCK_M = 0.002  # chosen: a camera that moves less than this in a step counts as arrived, because it cannot come nearer
+TURN_M = 0.10  # chosen: nearer than this to its viewpoint the camera turns as planned; before, it looks at the target
+NEARER = 0.3  # chosen: nats per metre of distance, so that the nearest of equally informative viewpoints is taken
+SPREAD_M = 0.10  # from the published code: standard deviation of the candidates' ranges around the goal's range
+CELL_RAD = 0.045  # derived: half a cell of the viewing grid; a candidate's direction is drawn within its cell
+SPREAD = 0.02  # chosen: relative standard deviation of the range of candidates that are drawn from the goal posterior
+VISITED_M = 0.05  # chosen: viewpoints within about this distance of one that was not the goal's also become costly
+VISITED_RAD = 0.35  # chosen: viewpoints within about this angle of one that was not the goal's also become costly
+VISITED_COST = 6.0  # chosen: nats that are added to the cost of a viewpoint that was not the goal's
+DOUBT_LIMIT = 2.5  # chosen: after wrong viewpoints the goal's log posterior is divided by at most this
+SURE = 0.6  # chosen: the agent says that it is at the goal's view if the probability of this is higher
+PEAK_ROWS = 2  # chosen: the posterior's peak is averaged over this many cells of elevation on each side
+PEAK_COLUMNS = 4  # chosen: the posterior's peak is averaged over this many cells of azimuth on each side
+PUBLISHED = 64  # number of candidates in a plan message; it changes nothing that the agent does
 
 
 class Planner:
-    """Beliefs in, plans and actions out."""
+    """Turns beliefs into plans and actions.
+
+    Raises SaccadeError if the weights are missing or damaged, or if they lack an object.
+    """
 
     def __init__(self, config: Config, names: tuple[str, ...]):
         self.config, self.names = config, names
@@ -65,17 +68,17 @@ class Planner:
         self.sizes_m = {card.name: card.size_m for card in Weights(config.weights).cards_of(names)}
 
     def begin(self, run: str, episode: int) -> Iterable[Output]:
-        """A new goal."""
+        """Starts an episode with a new goal. Nothing is published."""
         self.episode, self.goal_known = episode, False
         self.preference: Preference | None = None
-        self.plan: Plan | None = None  # as it was chosen
-        self.age = 0
-        self.before: Array | None = None  # where the camera was
-        self.visited: list[Array] = []  # views [4, 4] in which the target was seen not to be as in the goal
+        self.plan: Plan | None = None  # as it was when it was chosen
+        self.age = 0  # steps since the plan was chosen
+        self.before: Array | None = None  # pose of the camera at the last step [4, 4]
+        self.visited: list[Array] = []  # camera poses [4, 4] at which the agent has arrived in the mode "goal"
         return ()
 
     def step(self, inputs: Inputs) -> Iterable[Output]:
-        """A plan and an action from the beliefs of one step."""
+        """Yields a plan and an action, computed from the beliefs about all objects at one step."""
         beliefs: dict[str, Belief] = inputs["belief"]
         stamp = beliefs[self.names[0]]
         camera = stamp.world_from_camera
@@ -83,7 +86,7 @@ class Planner:
             self.goal_known = True
             preference = infer_preference(inputs["goal_percept"], self.config.planner.range_std_m)
             self.confidence = preference.confidence
-            # an image of nothing that is known sets no preference: what remains is to explore
+            # A goal image that shows no known object sets no preference. The agent then explores.
             known = preference.confidence >= self.config.planner.goal_confidence
             self.preference = preference if known and not self.config.scene.explore else None
         self._refine(beliefs)
@@ -101,7 +104,7 @@ class Planner:
         self.before = camera
         heading = self._heading(camera, chosen, beliefs)
         translation, rotation = step_towards(camera, heading, spheres, self.config.planner.step_m)
-        if declared:  # it is judged where it says so
+        if declared:  # the agent is judged at the pose at which it says that it has arrived, so it must not move
             translation, rotation = np.zeros(3), np.zeros(3)
         plan = self._published(chosen, stamp, camera, beliefs, declared)
         yield Output(PLAN, plan)
@@ -109,19 +112,24 @@ class Planner:
                                     rotation_rad=rotation, arrived=declared))
 
     def _refine(self, beliefs: dict[str, Belief]) -> None:
-        """Takes the goal's range from the belief, which corrects it by what views alike get wrong."""
+        """Takes the goal's range from the belief, which corrects it by the error that similar views have."""
         if self.preference and beliefs[self.preference.target].goal_range_m > 0:
             self.preference = replace(self.preference, range_m=beliefs[self.preference.target].goal_range_m)
 
     def _arrived(self, camera: Array, viewpoint: Array) -> bool:
-        if self.moved_by_others:  # it may stand still anywhere, and no hand is exact
+        """Whether the camera is at the viewpoint, or as near as it can come."""
+        if self.moved_by_others:  # a person may pause anywhere and is not exact, so the task's tolerance counts
             return success(camera, viewpoint)
         moved = _between(camera, self.before) if self.before is not None and self.age > 1 else (1.0, 1.0)
         near = _between(camera, viewpoint)
         return (near[0] < ARRIVED_M and near[1] < ARRIVED_RAD) or (moved[0] < STUCK_M and moved[1] < ARRIVED_RAD)
 
     def _heading(self, camera: Array, plan: Plan, beliefs: dict[str, Belief]) -> Array:
-        """Where to go and how to look meanwhile [4, 4]: at the point of interest on the way, as planned on arrival."""
+        """The camera pose to move towards [4, 4].
+
+        Its position is that of the viewpoint. On the way the camera looks at the target (at the plan's look-at point
+        while it searches), and near the viewpoint it takes the planned attitude.
+        """
         if np.linalg.norm(plan.viewpoint[:3, 3] - camera[:3, 3]) < TURN_M:
             return plan.viewpoint
         gaze = plan.look_at_m if plan.mode == "search" else beliefs[plan.target].mean_m
@@ -130,20 +138,24 @@ class Planner:
         return heading
 
     def _obstacles(self, beliefs: dict[str, Belief]) -> Spheres:
-        """Spheres around what is believed to stand there."""
+        """Spheres around the objects whose presence and position the agent is sure of."""
         known = [b for b in beliefs.values() if b.presence > 0.5 and np.trace(b.covariance_m2) < KNOWN_M ** 2]
         return spheres_around(np.array([b.mean_m for b in known]).reshape(-1, 3),
                               np.array([self.sizes_m[b.object] for b in known]).reshape(-1, 3))
 
     def _mode(self, beliefs: dict[str, Belief]) -> str:
-        """search: the target is not found; approach: found, but its goal view is not known; goal: it is."""
+        """The mode of the plan.
+
+        `search`: the target is not found yet. `approach`: it is found, but there is no posterior over the goal's
+        direction yet. `goal`: there is one.
+        """
         target = beliefs[self.preference.target] if self.preference else None
         if target is None or np.trace(target.covariance_m2) > FOUND_M ** 2 or target.presence <= 0.5:
             return "search"
         return "approach" if target.goal_log_posterior is None else "goal"
 
     def _choose(self, stamp: Belief, mode: str, beliefs: dict[str, Belief], camera: Array, spheres: Spheres) -> Plan:
-        """Draws candidates, weighs them, takes the best."""
+        """Draws candidate viewpoints, computes their cost and returns the plan with the best one."""
         rng = generator(self.config.seed, self.config.bus.world, self.episode, stamp.step, "planner")
         found, best = self.preference if mode != "search" else None, None
         eyes, gazes = self._candidates(beliefs, rng)
@@ -153,10 +165,10 @@ class Planner:
             eyes, gazes = np.vstack([eyes, best[:3, 3]]), np.vstack([gazes, target.mean_m])
         eyes = np.clip(eyes, LOWER_M, UPPER_M)
         terms = expected_free_energy(eyes, gazes, beliefs, found, self.config.planner.information_weight)
-        if found is not None:  # each time that the best was not it, the belief is trusted less, other places are tried
+        if found is not None:  # after each wrong viewpoint, pose and scale are trusted less, so others are tried
             cost = (terms.pose + terms.scale) / self._doubt + terms.position + terms.information
             cost = cost + self._visited_cost(eyes, beliefs[found.target].mean_m)
-        else:  # among views that tell the same, the nearest
+        else:  # of equally informative viewpoints the nearest is taken
             cost = terms.total + NEARER * np.linalg.norm(eyes - camera[:3, 3], axis=1)
         chosen = int(np.argmin(cost))
         if found is None or best is None:
@@ -172,13 +184,18 @@ class Planner:
 
     @property
     def _doubt(self) -> float:
-        """By how much the belief about the goal's view is softened: more after every view that was not it, to a limit,
-        or the agent would forget what it knows."""
+        """What the goal's log posterior is divided by, at least 1.
+
+        It grows with every wrong viewpoint. It has a limit, because otherwise the agent would forget what it knows.
+        """
         return min(1.0 + len(self.visited), DOUBT_LIMIT)
 
     def _candidates(self, beliefs: dict[str, Belief], rng: np.random.Generator) -> tuple[Array, Array]:
-        """Eyes and look-at points [N, 3]: a third from the goal posterior, a third at the goal's range, a third
-        anywhere; the look-at points from the particles."""
+        """Draws the positions and the look-at points of N candidates, each [N, 3] (m, world).
+
+        A third of the positions is drawn from the posterior over the goal's direction, a third at the goal's range, and
+        a third anywhere. The look-at points are drawn from the particles.
+        """
         count, preference = self.config.planner.candidates, self.preference
         watched = [beliefs[preference.target]] if preference is not None else list(beliefs.values())
         clouds = np.concatenate([belief.particles_m for belief in watched]).astype(np.float64)
@@ -202,7 +219,7 @@ class Planner:
         return eyes, gazes
 
     def _visited_cost(self, eyes: Array, center: Array) -> Array:
-        """A price on views of `center` [3] like those in which the target was seen not to be as in the goal [N]."""
+        """Cost [N] (nats) of views from `eyes` [N, 3] of `center` [3] that are like views that were not the goal's."""
         cost = np.zeros(len(eyes))
         if not self.visited:
             return cost
@@ -214,8 +231,11 @@ class Planner:
         return cost
 
     def _goal_viewpoint(self, preference: Preference, target: Belief, eye: Array) -> Array:
-        """The view from `eye` [3] that shows the target at the goal's pixel [4, 4]. As in the environment, the position
-        is clipped (when the camera moves there) and the attitude is kept."""
+        """The camera pose [4, 4] at `eye` [3] that shows the target at the pixel where the goal image shows it.
+
+        With `planner.goal_pixel=false` it looks straight at the target. As in the environment, a position that the
+        camera may not enter is clipped only when the camera moves there, and the attitude is kept.
+        """
         if not self.config.planner.goal_pixel:
             return look_at(eye, target.mean_m)
         return aim(eye, target.mean_m, preference.pixel, preference.intrinsics_px)
@@ -230,7 +250,7 @@ class Planner:
             arrived=False)
 
     def _published(self, plan: Plan, stamp: Belief, camera: Array, beliefs: dict[str, Belief], declared: bool) -> Plan:
-        """The plan as it stands at this step."""
+        """The chosen plan with the step, the distance to the goal and the declaration of the present step."""
         distance, target = -1.0, beliefs.get(plan.target)
         if self.preference is not None and target is not None and target.goal_log_posterior is not None:
             eye = _peak(target.mean_m, target.goal_log_posterior, self.preference.range_m)
@@ -239,8 +259,11 @@ class Planner:
 
 
 def _peak(center: Array, log_posterior: NDArray[np.float32], range_m: float) -> Array:
-    """The eye [3] at the posterior's peak, averaged over its neighbours, at the goal's range. Azimuth and elevation
-    are averaged apart: near the pole neighbours in space may be views turned half round."""
+    """The camera position [3] at the goal's range in the direction of the posterior's peak.
+
+    The peak is averaged over its neighbours in the grid. Azimuth and elevation are averaged separately, because near
+    the pole two positions may be neighbours although their images are rotated by half a turn.
+    """
     elevation, azimuth = viewing_grid()
     fine = log_posterior.astype(np.float64)
     row, column = map(int, np.unravel_index(np.argmax(fine), fine.shape))
@@ -259,5 +282,5 @@ def _between(a: Array, b: Array) -> tuple[float, float]:
 
 
 def build(config: Config) -> Planner:
-    """The core for a run's configuration."""
+    """Creates the core from a run's configuration. Raises SaccadeError if the weights do not serve its objects."""
     return Planner(config, config.names)

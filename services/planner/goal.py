@@ -1,4 +1,4 @@
-"""What the goal image asks for: which object, at which scale, where in the image (paper, section 3.3)."""
+"""What the goal image asks for: which object, at which range, and at which pixel (paper, section 3.3)."""
 
 from __future__ import annotations
 
@@ -13,18 +13,24 @@ from saccade.shared.world.geometry import REFERENCE_RANGE_M, Array, look_at, pix
 
 @dataclass(frozen=True)
 class Preference:
-    """The prior preference over observations: the target, its range (metres) with a deviation, its pixel [2]."""
+    """The prior preference over observations: the target, its range and standard deviation (m), and its pixel [2].
+
+    `intrinsics_px` (fx, fy, cx, cy) are those of the goal image.
+    """
 
     target: str
     range_m: float
     range_std_m: float
     pixel: NDArray[np.float64]
     intrinsics_px: NDArray[np.float64]
-    confidence: float  # that the target is in the goal image
+    confidence: float  # probability that the target is in the goal image
 
 
 def infer_preference(percepts: dict[str, Percept], range_std_m: float) -> Preference:
-    """The preference in the goal's percepts: the object that the goal image shows most surely."""
+    """The preference from the goal image's percepts. The target is the object with the highest presence.
+
+    `range_std_m` is the standard deviation of the preferred range; the uncertainty of the percept's scale is added.
+    """
     name = max(sorted(percepts), key=lambda n: percepts[n].presence)
     percept = percepts[name]
     range_m = REFERENCE_RANGE_M / percept.scale
@@ -33,15 +39,18 @@ def infer_preference(percepts: dict[str, Percept], range_std_m: float) -> Prefer
 
 
 def aim(position: ArrayLike, target: ArrayLike, pixel: ArrayLike, intrinsics_px: ArrayLike) -> Array:
-    """world_from_camera [4, 4] without roll at `position` [3] that sees `target` [3] at `pixel` (u, v)."""
+    """The pose world_from_camera [4, 4] at `position` [3] that sees `target` [3] at `pixel` (u, v), without roll.
+
+    If no camera without roll can see it there, the camera looks straight at the target.
+    """
     position, target = np.asarray(position, dtype=np.float64), np.asarray(target, dtype=np.float64)
     ray = pixel_rays(pixel, intrinsics_px)  # camera frame
     towards = unit(target - position)
     reach = np.hypot(ray[1], ray[2])
     pitch = np.arcsin(np.clip(towards[2] / reach, -1.0, 1.0)) - np.arctan2(ray[1], -ray[2])
-    if abs(pitch) > np.pi / 2:  # no camera without roll sees it there: look straight at it
+    if abs(pitch) > np.pi / 2:
         return look_at(position, target)
-    # with the heading along +x: right is -y, up is (-sin pitch, 0, cos pitch), back is -(cos pitch, 0, sin pitch)
+    # If the heading is +x: right is -y, up is (-sin pitch, 0, cos pitch), back is -(cos pitch, 0, sin pitch).
     rotation = np.array([[0.0, -np.sin(pitch), -np.cos(pitch)], [-1.0, 0.0, 0.0],
                          [0.0, np.cos(pitch), -np.sin(pitch)]])
     seen = rotation @ ray

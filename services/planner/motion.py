@@ -1,4 +1,7 @@
-"""Short steps towards a pose, around spheres that the camera may not enter: believed ones, or the true ones."""
+"""Short steps towards a camera pose, around spheres that the camera may not enter.
+
+The planner passes the spheres that it believes in, the oracle the true ones.
+"""
 
 from __future__ import annotations
 
@@ -13,39 +16,43 @@ from saccade.shared.world.geometry import Array, direction, euler_xyz, fibonacci
 from saccade.shared.world.task import ACTION_LIMIT, LOWER_M, UPPER_M, Spheres, clip
 
 STEP_M = 0.05
-_SLACK_M = 1e-6  # a camera that was pushed onto a sphere is outside it
-_DETOUR = 1.12  # corners of a detour lie on a sphere this much larger: neighbours among 48 see each other past it
+_SLACK_M = 1e-6  # numerical slack: a camera that was pushed onto the surface of a sphere counts as outside
+# Corners of a detour lie on a sphere that is larger by this factor. Then the line between two neighbours of the 48
+# corners does not cut the original sphere.
+_DETOUR = 1.12
 _AZIMUTH, _ELEVATION = fibonacci_hemisphere(48)
-_CORNERS = direction(_AZIMUTH, np.arcsin(2.0 * np.sin(_ELEVATION) - 1.0))  # even over the whole sphere
-_SHELLS_M = np.arange(0.01, 0.5, 0.01)  # how far to look for a place outside all spheres
-_SHARES = np.linspace(0.05, 0.95, 19)  # of the way from a place to a sphere's centre
-_WORTH_M = 0.01  # for less, no long move into a sphere
+_CORNERS = direction(_AZIMUTH, np.arcsin(2.0 * np.sin(_ELEVATION) - 1.0))  # spread evenly over the whole sphere
+_SHELLS_M = np.arange(0.01, 0.5, 0.01)  # distances at which a position outside all spheres is searched
+_SHARES = np.linspace(0.05, 0.95, 19)  # of the way from a position to the centre of a sphere
+_WORTH_M = 0.01  # a long move into a sphere is made only if it comes nearer to the goal by more than this
 
 
 def step_towards(world_from_camera: ArrayLike, goal_world_from_camera: ArrayLike, spheres: Spheres,
                  step_m: float = STEP_M) -> tuple[Array, Array]:
-    """The next action, (translation [3] m, rotation [3] rad), on the way from a camera pose [4, 4] to a goal pose.
+    """The next action (translation [3] in m, rotation [3] in rad) from a camera pose [4, 4] towards a goal pose [4, 4].
 
-    Moves at most `step_m` along the shortest way found around the spheres, so the way left shrinks with every step and
-    the camera never gets stuck. Only into a sphere, where goals may lie, the last move may be longer: see `reach`.
-    Turns along the great arc, at most 0.5 rad about each axis.
+    The camera moves at most `step_m` along the shortest path that was found around the spheres. So the remaining path
+    becomes shorter with every step, and the camera never gets stuck. A goal may lie inside a sphere; only then the last
+    move may be longer (see `reach`). The camera turns along the great arc, at most 0.5 rad about each axis.
     """
     camera = np.asarray(world_from_camera, dtype=np.float64)
     goal = np.asarray(goal_world_from_camera, dtype=np.float64)
     here, there = camera[:3, 3], goal[:3, 3]
     way = way_around(here, there, spheres)
-    gap = np.linalg.norm(way[-1] - there)  # none unless the goal is inside a sphere
+    gap = np.linalg.norm(way[-1] - there)  # 0 unless the goal is inside a sphere or outside the workspace
     inwards = gap > _SLACK_M and np.linalg.norm(here - there) <= gap + _SLACK_M
     position = reach(there, spheres, here) if inwards else _along(way, step_m)
     return position - here, turn_towards(camera[:3, :3], goal[:3, :3])
 
 
 def reach(goal: ArrayLike, spheres: Spheres, start: ArrayLike) -> Array:
-    """The position [3] to command from `start`, in one action, for which `clip` leaves the camera nearest to the goal.
+    """The position [3] to command from `start` [3] in one action so that the camera ends as near as possible to `goal`.
 
-    A sphere pushes all that lies between its centre and a place to the same side, past the spheres before it. So a goal
-    inside one sphere can be reached by a command that lies deep in another; pushes by two are tried as well. A place
-    outside all spheres is preferred to one that is hardly nearer.
+    After an action `clip` pushes the camera out of one sphere after another. A sphere pushes every point on a ray from
+    its centre to the same point of its surface, and this point may lie inside an earlier sphere. So a goal inside one
+    sphere can be reached by a command that lies deep inside another one. Commands that use two such pushes are tried as
+    well. A position outside all spheres is preferred unless another one comes nearer
+    by more than 1 cm. Commands beyond the limit of an action are not used.
     """
     goal = np.asarray(goal, dtype=np.float64)
     commands = goal[None]
@@ -60,21 +67,23 @@ def reach(goal: ArrayLike, spheres: Spheres, start: ArrayLike) -> Array:
 
 
 def turn_towards(rotation: ArrayLike, goal_rotation: ArrayLike) -> Array:
-    """Angles [3] (radians, about the fixed axes, each at most 0.5) that turn one rotation [3, 3] towards another."""
+    """Angles [3] (radians, about the fixed axes, each at most 0.5) that turn `rotation` [3, 3] towards another."""
     turn = Rotation.from_matrix(np.asarray(goal_rotation) @ np.asarray(rotation).T).as_rotvec()
     angle = float(np.linalg.norm(turn))
     angles = euler_xyz(Rotation.from_rotvec(turn).as_matrix())
     share = 1.0
-    while np.abs(angles).max() > ACTION_LIMIT:  # Euler angles are not linear in the share: approach it from above
+    # Euler angles are not linear in the share of the turn. So the share is reduced until the angles are allowed.
+    while np.abs(angles).max() > ACTION_LIMIT:
         share = min(0.95 * share, ACTION_LIMIT * 1.1 / angle)
         angles = euler_xyz(Rotation.from_rotvec(share * turn).as_matrix())
     return angles
 
 
 def way_around(start: ArrayLike, goal: ArrayLike, spheres: Spheres) -> Array:
-    """Corner points [K, 3] of a way from start to goal outside the spheres; the straight one where it is free.
+    """Corner points [K, 3] of a path from start to goal outside the spheres: a straight line if that is free.
 
-    A start inside a believed sphere is taken as on its surface: the camera is there, so the belief is off.
+    If the start is inside a believed sphere, the belief is wrong, because the camera is there. The sphere is then
+    reduced so that the start is on its surface.
     """
     start = np.asarray(start, dtype=np.float64)
     goal = _outside(goal, spheres)
@@ -86,7 +95,7 @@ def way_around(start: ArrayLike, goal: ArrayLike, spheres: Spheres) -> Array:
     lengths = np.linalg.norm(points[:, None] - points[None], axis=-1)
     lengths[~_free(points, points, spheres)] = 0.0  # no edge
     _, before = dijkstra(lengths, indices=1, return_predecessors=True)
-    if before[0] < 0:  # walled in by wrong beliefs: leave upwards, over everything
+    if before[0] < 0:  # wrong beliefs leave no free path: move up first, then above all objects
         return np.stack([start, np.array([start[0], start[1], UPPER_M[2]]), goal])
     way = [0]
     while way[-1] != 1:
@@ -95,7 +104,10 @@ def way_around(start: ArrayLike, goal: ArrayLike, spheres: Spheres) -> Array:
 
 
 def _corners(start: Array, goal: Array, spheres: Spheres) -> Array:
-    """Where a way may bend [K, 3]: around each sphere, above both ends, and outwards from the sphere an end touches."""
+    """Points where a path may bend [K, 3].
+
+    They lie around each sphere, above the start and the goal, and next to both ends, away from each sphere's centre.
+    """
     around = spheres.centers_m[:, None] + _DETOUR * spheres.radii_m[:, None, None] * _CORNERS
     heights = np.linspace(LOWER_M[2], UPPER_M[2], 6)
     above = [np.array([*end[:2], height]) for end in (start, goal) for height in heights]
@@ -106,7 +118,7 @@ def _corners(start: Array, goal: Array, spheres: Spheres) -> Array:
 
 
 def _outside(position: ArrayLike, spheres: Spheres) -> Array:
-    """The position [3] after `clip`; where that is inside a sphere, the nearest found [3] that is in none."""
+    """The position [3] after `clip`. If this is inside a sphere, the nearest position found outside all spheres."""
     clipped = clip(position, spheres)
     if spheres.depth_m(clipped) <= _SLACK_M:
         return clipped
@@ -116,14 +128,14 @@ def _outside(position: ArrayLike, spheres: Spheres) -> Array:
 
 
 def _allowed(points: Array, spheres: Spheres) -> Array:
-    """Those of the points [K, 3] that are in the workspace and in no sphere."""
+    """The points of [K, 3] that are in the workspace and outside all spheres."""
     inside_workspace = ((points >= LOWER_M) & (points <= UPPER_M)).all(axis=1)
     outside = (np.linalg.norm(points[:, None] - spheres.centers_m, axis=-1) >= spheres.radii_m).all(axis=1)
     return points[inside_workspace & outside]
 
 
 def _free(starts: Array, ends: Array, spheres: Spheres) -> np.ndarray:
-    """Whether the segments from starts [A, 3] to ends [B, 3] stay outside all spheres: [A, B]."""
+    """Whether the segment from each start [A, 3] to each end [B, 3] stays outside all spheres: truth values [A, B]."""
     along = ends[None] - starts[:, None]
     square = np.maximum((along ** 2).sum(-1), 1e-18)
     free = np.ones(square.shape, dtype=bool)
@@ -137,7 +149,7 @@ def _free(starts: Array, ends: Array, spheres: Spheres) -> np.ndarray:
 
 
 def _along(way: Array, distance_m: float) -> Array:
-    """The point [3] this far along a way [K, 3], or its end."""
+    """The point [3] at this distance along a path [K, 3], or the end of the path if it is shorter."""
     for here, there in pairwise(way):
         length = float(np.linalg.norm(there - here))
         if length > distance_m:

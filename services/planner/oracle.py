@@ -1,4 +1,4 @@
-"""The oracle: an agent that is told the goal's pose. It shows that a scene can be solved, and how well at best."""
+"""The oracle: an agent that knows the goal's pose. It shows whether a scene can be solved, and how well at best."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ SERVICE = Service("oracle", inputs=(TRUTH,), trigger=TRUTH, outputs=(ACTION,))
 
 
 class Oracle:
-    """Moves straight to the goal's pose, around the objects; has no state."""
+    """Moves to the goal's pose on the shortest path around the objects. It has no state."""
 
     def __init__(self, step_m: float = STEP_M):
         self.step_m = step_m
 
     def begin(self, run: str, episode: int) -> list[Output]:
-        """Nothing to forget."""
+        """Does nothing, because the oracle has no state. Nothing is published."""
         return []
 
     def step(self, inputs: Inputs) -> list[Output]:
-        """The next action; none once the episode is done."""
+        """Returns the next action, or nothing when the episode is over."""
         truth: Truth = inputs["truth"]
         if truth.done:
             return []
@@ -38,5 +38,5 @@ class Oracle:
 
 
 def build(config: Config) -> Oracle:
-    """The oracle of a configuration: it takes the planner's steps."""
+    """Creates the oracle from a configuration. Its steps are as long as the planner's (`planner.step_m`)."""
     return Oracle(config.planner.step_m)

@@ -1,4 +1,4 @@
-"""python -m saccade.services.recorder --config FILE: every message of the world into run.mcap."""
+"""Runs the recorder, which writes every message into run.mcap: `python -m saccade.services.recorder --config FILE`."""
 
 from saccade.services.recorder.core import main
 

@@ -1,4 +1,7 @@
-"""The recorder: a deep queue before a log. It takes everything and says what it did not get."""
+"""The recorder: it writes every message of the world into a log, and says which messages it did not get.
+
+A long queue in front of the log takes the messages that arrive while it writes.
+"""
 
 from __future__ import annotations
 
@@ -29,13 +32,16 @@ from saccade.shared.loop.process import Health, Heartbeat, Inbox, Item, run_proc
 
 NAME = "recorder"
 QUEUE_BYTES = 512 * 1024 * 1024
-ASKED_AGAIN_S = 0.5
-QUIET_S = 1.5  # after so long without news the publishers are asked
+ASKED_AGAIN_S = 0.5  # time until missing messages are asked for again; it doubles with every attempt
+QUIET_S = 1.5  # after this time without a new message the publishers are asked for their latest ones
 PACKAGES = ("saccade", "eclipse-zenoh", "mcap", "msgpack", "numpy", "mujoco", "torch")
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """The recorder's process; the log stands beside the configuration file. Exit code 2 if the log is not complete."""
+    """Runs the recorder's process. The log is in the folder of the configuration file.
+
+    The exit code is 2 if the log is not complete.
+    """
     run_process(NAME, _work, inbox=Inbox(QUEUE_BYTES), argv=argv)
 
 
@@ -55,20 +61,27 @@ def _work(config: Config, folder: Path, inbox: Inbox) -> None:
 
 
 class Recorder:
-    """Writes what arrives into the run's log. What it missed, started again, late or cut off, it asks the publishers
-    for; what they said twice is written once. A log of this run that is there already is gone on with."""
+    """Writes the messages that arrive into the run's log, each of them once.
+
+    It may miss messages because it was started late or again, or because it was cut off from the bus. It asks the
+    publishers for them. If there is already a log of this run, it is continued. Raises SaccadeError if the log cannot
+    be written, or if it belongs to another run.
+    """
 
     def __init__(self, bus: Bus, folder: Path, config: Config) -> None:
         self.health, self._bus, self._run = Health(NAME), bus, config.run or folder.name
         self._sequences = Sequences(from_start=True, cut=config.bus.first_step > 0)
-        self._last: dict[Key, tuple[int, int]] = {}  # of each key: episode and step
+        self._last: dict[Key, tuple[int, int]] = {}  # newest (episode, step) of each key
         self._names = config.scene.names or ()
         self._asked_s, self._ask_again_s, self._news_s = 0.0, ASKED_AGAIN_S, time.monotonic()
         self.log = self._open(folder / LOG_NAME, config)
 
     def record(self, inbox: Inbox) -> Health:
-        """Until the inbox is stopped. A log that can take no more does not stop the agent: it is said on the bus at
-        once, and raised as RecordingStopped at the end."""
+        """Records until the inbox is stopped. Returns its health, with the counters.
+
+        If the log cannot be written any more, the agent continues. The recorder says so on the bus at once, and raises
+        RecordingStopped at the end.
+        """
         health, stopped = self.health, None
         works: Iterable[Callable[[], object]] = itertools.chain(
             [self._ask_for_news, lambda: health.say("ready")],
@@ -85,7 +98,7 @@ class Recorder:
         return health
 
     def _work_off(self, item: Item | None) -> None:
-        """A message, or that none has come for a while."""
+        """Takes a message, or does regular work if none has come for a while (None)."""
         if item is not None:
             self._take(*item)
         else:
@@ -98,7 +111,8 @@ class Recorder:
             self._ask_for_missing()
 
     def _open(self, path: Path, config: Config) -> RunLog:
-        before = path.with_suffix(".before.mcap")  # is there while a log is copied that a killed recorder left
+        """Opens the log, with the messages of a log that a killed recorder has left."""
+        before = path.with_suffix(".before.mcap")  # the log that was left; it exists until it has been copied
         if path.exists() and not before.exists():
             path.rename(before)
         path.unlink(missing_ok=True)
@@ -110,14 +124,14 @@ class Recorder:
                 before.unlink()
             return log
         except SaccadeError:
-            if before.exists():  # nothing that was recorded is lost
+            if before.exists():  # so that nothing that was recorded is lost
                 before.replace(path)
             raise
 
     def _copy(self, before: Path, log: RunLog) -> None:
-        """What the recorder had written before it was killed. Raises SaccadeError if that is another run's."""
+        """Copies what the recorder had written before it was killed. Raises SaccadeError if it is of another run."""
         reader = None
-        with contextlib.suppress(SaccadeError):  # killed before it wrote anything
+        with contextlib.suppress(SaccadeError):  # the recorder was killed before it wrote anything
             reader = RunReader(before)
         if reader is not None:
             for topic, part, payload, time_ns in reader.entries():
@@ -131,7 +145,8 @@ class Recorder:
         self.health.received += 1
         message = self._checked(topic, part, payload)
         if message is not None and message.run == self._run and self._sequences.begins(topic, part, message):
-            self._write_kept([topic], self._last[topic.name, part])  # how the last episode ended may be lost
+            # A new episode begins. The last messages of the episode before may be lost, so they are asked for.
+            self._write_kept([topic], self._last[topic.name, part])
         self._write(self.log, topic, part, payload, message)
         self.health.published = self.log.messages
         self._ask_for_missing()
@@ -139,20 +154,23 @@ class Recorder:
             self._ask_for_held(message.episode)
 
     def _ask_for_news(self) -> None:
-        """What came last may have been lost with nothing after it to tell."""
+        """Asks for the newest messages. If the newest is lost, there is no later one whose number would show this."""
         episode, step = max(self._last.values(), default=(0, 0))
         self._write_kept([t for t in TOPICS.values() if t.in_step and not t.latched], (episode, max(0, step - 1)))
         self._ask_for_held(episode)
 
     def _ask_for_held(self, episode: int) -> None:
-        """What holds for a whole episode comes once in it: no number tells that it was lost."""
+        """Asks for the latched messages of an episode. Each comes once per episode, so no number shows its loss."""
         for topic in (topic for topic in TOPICS.values() if topic.latched):
             keys = [(topic.name, name) for name in self._names] if topic.parts else [(topic.name, None)]
             if not all(self._sequences.has_begun(key, self._run, episode) for key in keys):
                 self._write_kept([topic], (episode, 0))
 
     def _ask_for_missing(self) -> None:
-        """Every now and then, less often the longer it is in vain: a publisher may have to find the bus again."""
+        """Asks for missing messages from time to time, less often with every attempt.
+
+        It keeps asking, because a publisher may first have to connect to the bus again.
+        """
         missing = self._sequences.missing
         self.health.gaps = sum(missing.values())
         if not missing:
@@ -165,13 +183,16 @@ class Recorder:
                              (self._sequences.first_missing, 0))
 
     def _write_kept(self, topics: Sequence[Topic], since: tuple[int, int]) -> None:
+        """Asks the publishers for the messages that they have kept since (episode, step), and writes them."""
         kept = self._bus.recall(topics, (self._run, *since), KEPT_BYTES)
         for topic, part, payload, _, published_ns in sorted(kept, key=lambda k: k.published_ns):
             self._write(self.log, topic, part, payload, self._checked(topic, part, payload), published_ns)
 
     def _checked(self, topic: Topic, part: str | None, payload: bytes) -> Message | None:
-        """The whole message: what is none must not take the number of one. It is recorded all the same: the log is
-        what was on the wire."""
+        """Decodes a message. Returns None if it is not valid, so that it does not take the number of a valid one.
+
+        A message that is not valid is recorded all the same, because the log holds what was on the bus.
+        """
         try:
             return decode(topic.type, payload)
         except MessageError as error:
@@ -183,7 +204,7 @@ class Recorder:
         if message is not None:
             if (lost := self._sequences.take(topic, part, message)) is None:
                 return
-            if lost and time_ns is None:  # what came before it stands before it
+            if lost and time_ns is None:  # the missing ones come first, so that the log is in order
                 self._ask_for_missing()
             if topic.in_step and message.run == self._run:
                 key = topic.name, part
@@ -192,7 +213,7 @@ class Recorder:
 
 
 def describe(config: Config, run: str) -> dict[str, dict[str, str]]:
-    """What the log says about its origin: configuration hash, seed, versions, weights' hashes."""
+    """The origin of the log: run, seed, commit, hash of the configuration, versions, hashes of the weights."""
     text = config.model_dump_json()
     cut = {CUT: {"start": str(config.bus.first_step)}} if config.bus.first_step else {}
     return {**cut, "run": {"run": run, "seed": str(config.seed), "commit": commit(),

@@ -1,4 +1,4 @@
-"""Playing a log: which of its messages, in what time, and under whose thumb."""
+"""Plays a log: selects its messages, times them, and lets the user pause."""
 
 from __future__ import annotations
 
@@ -25,8 +25,11 @@ POLL_S = 0.02
 
 @dataclass(frozen=True)
 class Selection:
-    """Which messages of a log. Steps count within each episode; `end_step` is the last one. Latched messages (the
-    goal) are there whatever the first step is."""
+    """Which messages of a log are played.
+
+    Steps are counted within each episode, and `end_step` is the last one that is played. Latched messages (the goal)
+    are played even if they come before `start_step`.
+    """
 
     topics: tuple[Topic, ...]
     episode: int | None = None
@@ -42,8 +45,11 @@ class Selection:
 
 def steps_between(log: Path, clock: Topic, start_s: float | None, end_s: float | None, *,
                   episode: int | None = None) -> tuple[int, int, int]:
-    """(episode, first step, last step) of the `clock` topic's messages recorded between two times, in seconds from the
-    start of the log. Raises SaccadeError unless they are of one episode."""
+    """The episode, the first and the last step of the messages of topic `clock` that were recorded between two times.
+
+    Times are seconds from the start of the log. Raises SaccadeError if there is no such message, or if the messages
+    belong to several episodes.
+    """
     begin_ns, found = None, []
     for entry in RunReader(log).entries():
         begin_ns = entry.log_time_ns if begin_ns is None else begin_ns
@@ -62,14 +68,17 @@ def steps_between(log: Path, clock: Topic, start_s: float | None, end_s: float |
 
 
 class Pace:
-    """When the next message is due: `rate` times as fast as it was recorded, None for as fast as can be."""
+    """When the next message is due. Messages are played `rate` times as fast as recorded; None means without waiting.
+
+    `late_s` is the largest delay so far, in seconds.
+    """
 
     def __init__(self, rate: float | None = None) -> None:
         self.rate, self.late_s = rate, 0.0
         self._zero: tuple[int, float] | None = None
 
     def due_in_s(self, log_time_ns: int) -> float:
-        """Seconds to wait; negative where playing lags behind the clock."""
+        """Seconds to wait until a message with this log time is due. Negative if playing is behind the clock."""
         if self.rate is None:
             return 0.0
         if self._zero is None:
@@ -80,13 +89,16 @@ class Pace:
         return wait_s
 
     def paused(self, seconds: float) -> None:
-        """What the clock must leave out."""
+        """Tells the clock that playing was paused for this time."""
         if self._zero is not None:
             self._zero = (self._zero[0], self._zero[1] + seconds)
 
 
 class Keys:
-    """Key presses on the standard input, a terminal or a pipe; a context manager. `ended`: no more will come."""
+    """Key presses on the standard input, which is a terminal or a pipe. It is a context manager.
+
+    `ended` says that no more key presses will come.
+    """
 
     def __init__(self, enabled: bool = True) -> None:
         self.ended = not enabled
@@ -103,7 +115,7 @@ class Keys:
             termios.tcsetattr(sys.stdin, termios.TCSADRAIN, self._before)
 
     def pressed(self, wait_s: float = 0.0) -> str | None:
-        """The next key within so many seconds."""
+        """The next key that is pressed within `wait_s` seconds, or None."""
         if self.ended:
             if wait_s > 0:
                 time.sleep(wait_s)
@@ -118,8 +130,11 @@ class Keys:
 def play(entries: Iterator[Recorded], selection: Selection, pace: Pace, keys: Keys, *, one_by_one: bool = False,
          may_go_on: Callable[[Stamp], bool] = lambda _stamp: True,
          say: Callable[[str], None] = lambda _text: None) -> Iterator[tuple[Recorded, Stamp]]:
-    """The selected messages when they are due. Space pauses and goes on, q ends; `one_by_one` each key press gives one
-    message. `may_go_on(stamp)` holds the log back while those it is played to are too far behind."""
+    """Yields the selected messages when they are due.
+
+    The space key pauses and continues, q ends. With `one_by_one` each key press gives one message. Playing waits while
+    `may_go_on(stamp)` is false, for example because the receivers are too far behind. `say` gets texts for the user.
+    """
     for entry in entries:
         try:
             stamp = stamp_of(entry.payload)
@@ -140,7 +155,7 @@ def play(entries: Iterator[Recorded], selection: Selection, pace: Pace, keys: Ke
 
 
 def _wait(pace: Pace, entry: Recorded, keys: Keys, say: Callable[[str], None]) -> bool:
-    """Until the entry is due; whether to go on at all."""
+    """Waits until the entry is due. Returns False if the user has ended the replay."""
     paused = False
     while True:
         wait_s = pace.due_in_s(entry.log_time_ns)
@@ -150,7 +165,7 @@ def _wait(pace: Pace, entry: Recorded, keys: Keys, say: Callable[[str], None]) -
             return False
         if key == PAUSE:
             paused = not paused
-            say("paused: space goes on, q ends" if paused else "goes on")
+            say("paused: press space to continue, q to end" if paused else "continues")
         if paused:
             pace.paused(time.monotonic() - start_s)
         elif wait_s <= 0:

@@ -1,4 +1,4 @@
-"""python -m saccade.services.router --config FILE: a Zenoh router, where the other services meet."""
+"""Runs the router, which connects the other services: `python -m saccade.services.router --config FILE`."""
 
 from saccade.services.router.core import main
 

@@ -1,4 +1,4 @@
-"""The router: a Zenoh session that listens. It may die and come back: who was connected connects again."""
+"""The router: a Zenoh session that listens for connections. If it is restarted, the other services connect again."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ NAME = "router"
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """The router's process. Exit code 2 if the endpoint is taken."""
+    """Runs the router's process. Its exit code is 2 if the endpoint is in use already."""
     run_process(NAME, _work, argv=argv)
 
 

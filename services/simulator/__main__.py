@@ -1,4 +1,4 @@
-"""`python -m saccade.services.simulator --config FILE`: actions in, frames and the truth out."""
+"""Runs the simulator, which moves and renders the camera: `python -m saccade.services.simulator --config FILE`."""
 
 from saccade.shared.loop.main import main
 

@@ -1,4 +1,4 @@
-"""The simulator's core: actions in, frames and the truth out, by the rules of shared/world/task.py."""
+"""The core of the simulator: it takes actions and gives frames and the truth, by the rules of shared/world/task.py."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SERVICE = Service("simulator", inputs=(ACTION,), trigger=ACTION, outputs=(FRAME,
 
 
 class At(TypedDict):
-    """Where in a run a message belongs."""
+    """The run, the episode and the step of a message."""
 
     run: str
     episode: int
@@ -32,11 +32,11 @@ class At(TypedDict):
 
 
 class Simulator:
-    """One world, episode after episode. Episode k is scene k; `episodes` says how many there are.
+    """A world that runs one episode after the other. Episode k has scene k.
 
-    Every step gives the Truth and, until the episode is done, a Frame. With `goal_rgb` [H, W, 3] the user's image
-    stands in for the scene's goal: its view is unknown, so no step is a success and the agent's declaration ends the
-    episode.
+    Every step gives a Truth and, until the episode is over, a Frame. With `goal_rgb` [H, W, 3] the user's image
+    replaces the goal image of the scene. Its viewpoint is unknown, so no step is a success, and the episode ends when
+    the agent says that it has arrived.
     """
 
     def __init__(self, world: World, scenes: Sequence[Scene], *, max_steps: int = MAX_STEPS,
@@ -48,11 +48,14 @@ class Simulator:
 
     @property
     def episodes(self) -> int:
-        """How many episodes there are to run."""
+        """The number of episodes, which is the number of scenes."""
         return len(self.scenes)
 
     def begin(self, run: str, episode: int) -> list[Output]:
-        """Sets the scene; gives the goal, the first frame and the first truth."""
+        """Sets up the scene. Returns the goal, the first frame and the first truth.
+
+        Raises SaccadeError if there is no such episode.
+        """
         if not 0 <= episode < self.episodes:
             raise SaccadeError(f"episode {episode} does not exist: there are {self.episodes}, counted from 0")
         self.scene = self.scenes[episode]
@@ -67,7 +70,10 @@ class Simulator:
         return [Output(GOAL, goal), *self._outputs()]
 
     def step(self, inputs: Inputs) -> list[Output]:
-        """Moves the camera; gives what it sees then. Nothing once the episode is over."""
+        """Moves the camera. Returns the new frame (unless the episode is over now) and the truth.
+
+        Returns nothing if the episode was over before.
+        """
         if self.state.done:
             return []
         action = inputs["action"]
@@ -81,7 +87,10 @@ class Simulator:
         self.world.place({p.name: (p.center_m, p.yaw_rad) for p in objects}, self.scene.table_rgb)
 
     def _goal_image(self) -> NDArray[np.uint8] | None:
-        """The user's image, or the target alone on the table from the goal's pose; none while exploring."""
+        """The goal image [H, W, 3]: the user's, or the target alone on the table, rendered from the goal's pose.
+
+        None if the agent explores.
+        """
         if self.explore:
             return None
         if self.goal_rgb is not None:
@@ -110,7 +119,11 @@ class Simulator:
 
 
 def scenes_of(config: Config, sizes: Sizes) -> list[Scene]:
-    """The scenes that a configuration asks for: from its file, or drawn from its seed, one per episode."""
+    """The scenes of a configuration, one per episode: read from its file, or drawn from its seed.
+
+    `sizes` holds the objects that may occur. Raises SaccadeError if the file or the scene does not exist or is not
+    valid, or if the objects do not fit on the table.
+    """
     scene = config.scene
     if scene.file is not None:
         scenes = load_scenes(scene.file, tuple(sizes))
@@ -133,7 +146,10 @@ def scenes_of(config: Config, sizes: Sizes) -> list[Scene]:
 
 
 def build(config: Config) -> Simulator:
-    """The simulator of a configuration. Raises SaccadeError for what is missing or damaged, before anything runs."""
+    """Creates the simulator from a configuration.
+
+    Raises SaccadeError if an object, the scenes or the goal image are missing or damaged, or without OpenGL.
+    """
     scene = config.scene
     goal_rgb = read_goal_image(scene.goal_image) if scene.goal_image is not None else None
     meshes = tuple(load_mesh(scene.objects, name) for name in names_in_use(scene))

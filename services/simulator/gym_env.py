@@ -1,4 +1,4 @@
-"""Active search as a Gymnasium environment, for agents that are trained by reinforcement.
+"""Active search as a Gymnasium environment, for agents that are trained by reinforcement learning.
 
     import gymnasium, saccade.services.simulator.gym_env
     env = gymnasium.make("saccade/ActiveSearch-v0", n_objects=3)
@@ -26,19 +26,22 @@ from saccade.shared.world.geometry import IMAGE_SIZE_PX
 from saccade.shared.world.task import ACTION_LIMIT, MAX_STEPS, errors
 
 ID = "saccade/ActiveSearch-v0"
-Observation = dict[str, Any]  # of arrays
+Observation = dict[str, Any]  # name -> array
 
 
 class ActiveSearch(gymnasium.Env[Observation, NDArray[np.float64]]):
-    """Move a camera until it sees the goal image (paper, section 4.1).
+    """An environment in which a camera moves until it sees the goal image (paper, section 4.1).
 
-    Observation: `image` and `goal` [480, 480, 3] uint8, `pose` world_from_camera [4, 4] (metres).
-    Action [6] in [-0.5, 0.5]: translation (metres) and rotation about the fixed axes x, y, z (radians), world axes.
-    Reward: 1 on the step that reaches the goal (within 0.075 m and 0.5 rad), which terminates the episode; else 0.
-    Truncated after `max_steps`. `info` holds the scene's id and the errors in azimuth, elevation and range.
+    The observation has `image` and `goal` [480, 480, 3] uint8, and `pose`, which is world_from_camera [4, 4] (metres).
+    An action [6] is a translation (metres) along the axes of the world and a rotation about its fixed axes x, y and z
+    (radians). Each number is between -0.5 and 0.5. The reward is 1 in the step that reaches the goal (within 0.075 m
+    and 0.5 rad), otherwise 0. This step terminates the episode. The episode is truncated after `max_steps`. `info`
+    holds the id of the scene and the errors in azimuth, elevation and range.
 
-    Every reset draws a scene from the environment's generator: with `scenes` one of a file, in which `scene=<id>` in
-    reset's options picks one; else a new one with `n_objects` (any number where absent).
+    Every reset draws a scene with the environment's random generator. With a file `scenes` it draws one of the file's
+    scenes, or takes the one that reset's options name (`scene=<id>`). Without a file it draws a new scene with
+    `n_objects` objects, or with a random number of objects. Raises SaccadeError if an object or the file is missing or
+    damaged.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 - Gymnasium's interface
@@ -57,7 +60,10 @@ class ActiveSearch(gymnasium.Env[Observation, NDArray[np.float64]]):
         self._simulator: Simulator | None = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict]:
-        """A new scene. Raises SaccadeError for an id that the file does not have."""
+        """Starts an episode with a new scene. Raises SaccadeError if the scene in `options` is not in the file.
+
+        Returns the first observation and the info.
+        """
         super().reset(seed=seed)
         simulator = Simulator(self._world, [self._draw((options or {}).get("scene"))], max_steps=self.max_steps)
         outputs: dict[str, Any] = {o.topic.name: o.message for o in simulator.begin("gym", 0)}
@@ -75,7 +81,10 @@ class ActiveSearch(gymnasium.Env[Observation, NDArray[np.float64]]):
         return generate_scene(self.np_random, sizes, target, count, yaw=self.yaw)
 
     def step(self, action: NDArray[np.float64]) -> tuple[Observation, float, bool, bool, dict]:
-        """One action [6]; see the class for the reward."""
+        """Executes an action [6]. Returns the observation, the reward, terminated, truncated and the info.
+
+        Raises ResetNeeded before the first reset.
+        """
         simulator = self._simulator
         if simulator is None:
             raise gymnasium.error.ResetNeeded("call reset before step")
@@ -84,7 +93,7 @@ class ActiveSearch(gymnasium.Env[Observation, NDArray[np.float64]]):
         move = Action(run="gym", episode=0, step=state.step, translation_m=action[:3], rotation_rad=action[3:])
         messages = [output.message for output in simulator.step({"action": move})]
         frames = [message for message in messages if isinstance(message, Frame)]
-        image = frames[0].rgb if frames else self._world.render(state.camera)  # the last step has no frame of its own
+        image = frames[0].rgb if frames else self._world.render(state.camera)  # the last step has no frame
         return (self._observe(image, simulator), float(state.success), state.success, state.done and not state.success,
                 _info(simulator))
 
@@ -93,7 +102,7 @@ class ActiveSearch(gymnasium.Env[Observation, NDArray[np.float64]]):
         return {"image": image, "goal": self._goal.copy(), "pose": simulator.state.camera.copy()}
 
     def render(self) -> NDArray[np.uint8] | None:
-        """What the camera sees [480, 480, 3], in render mode rgb_array."""
+        """The camera's image [480, 480, 3] in the render mode `rgb_array`, otherwise None."""
         return self._image if self.render_mode == "rgb_array" else None
 
     def close(self) -> None:

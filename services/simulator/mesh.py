@@ -1,4 +1,4 @@
-"""Textured triangle meshes and how they are read from scans: Wavefront OBJ with a PNG or JPEG texture."""
+"""Textured triangle meshes, and how they are read from scans: Wavefront OBJ files with a PNG or JPEG texture."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from PIL import Image, UnidentifiedImageError
 
 from saccade.shared.errors import SaccadeError
 
-TEXTURE_MAX_PX = 2048  # beyond this a texel is far smaller than a pixel of the nearest view
+TEXTURE_MAX_PX = 2048  # with a larger texture a texel would be far smaller than a pixel, even in the nearest view
 
 
 @dataclass(frozen=True)
 class Mesh:
-    """A textured triangle mesh, its box centre at the origin.
+    """A textured triangle mesh. The centre of its box is at the origin.
 
-    vertices_m [V, 3], texture coordinates [V, 2] (v up), faces [F, 3], texture [H, W, 3] uint8.
+    It has vertices_m [V, 3], texture coordinates [V, 2] (v points up), faces [F, 3] and a texture [H, W, 3] uint8.
     """
 
     name: str
@@ -29,12 +29,15 @@ class Mesh:
 
     @property
     def size_m(self) -> NDArray[np.float64]:
-        """Extents [3] of the axis-aligned box."""
+        """Extents [3] of the axis-aligned box, metres."""
         return np.asarray(self.vertices_m.max(0) - self.vertices_m.min(0), dtype=np.float64)
 
 
 def read_obj(folder: Path, name: str) -> Mesh:
-    """Reads `textured.obj` and `texture_map.jpg|png` of a folder; raises SaccadeError with the path and what to do."""
+    """Reads `textured.obj` and `texture_map.jpg` or `.png` from a folder.
+
+    Raises SaccadeError, with the path and what to do, if a file is missing or damaged.
+    """
     path = folder / "textured.obj"
     if not path.is_file():
         raise SaccadeError(f"mesh {path} is missing: set SACCADE_YCB to a folder with {name}/textured.obj in it")
@@ -47,7 +50,11 @@ def read_obj(folder: Path, name: str) -> Mesh:
 
 
 def _parse_obj(lines: list[str]) -> tuple[NDArray, NDArray, NDArray]:
-    """Wavefront OBJ triangles with texture coordinates; one output vertex per distinct (vertex, texcoord) pair."""
+    """Parses triangles with texture coordinates from the lines of a Wavefront OBJ file.
+
+    Returns vertices [V, 3], texture coordinates [V, 2] and faces [F, 3], with one output vertex for each distinct pair
+    of a vertex and a texture coordinate. Raises ValueError or IndexError if the file is damaged.
+    """
     positions = np.array([line.split()[1:4] for line in lines if line.startswith("v ")], dtype=np.float32)
     coords = np.array([line.split()[1:3] for line in lines if line.startswith("vt ")], dtype=np.float32)
     corners = np.array([[c.split("/")[:2] for c in line.split()[1:]] for line in lines if line.startswith("f ")],
@@ -63,7 +70,10 @@ def _parse_obj(lines: list[str]) -> tuple[NDArray, NDArray, NDArray]:
 
 
 def read_texture(folder: Path) -> NDArray[np.uint8]:
-    """The texture [H, W, 3] beside a mesh, PNG or JPEG, at most TEXTURE_MAX_PX wide."""
+    """Reads the PNG or JPEG texture [H, W, 3] of a mesh. It is reduced to at most TEXTURE_MAX_PX in width and height.
+
+    Raises SaccadeError if it is missing or damaged.
+    """
     for path in (folder / "texture_map.png", folder / "texture_map.jpg", folder / "texture_map.jpeg"):
         if path.is_file():
             try:

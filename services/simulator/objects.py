@@ -1,6 +1,7 @@
-"""Object sets: where their meshes come from.
+"""The object sets, and where their meshes come from.
 
-`pantry` is made by code (`pantry.py`); `ycb` is read from the folder in SACCADE_YCB or the user's cache.
+The set `pantry` is made by code (`pantry.py`). The set `ycb` is read from the folder that the environment variable
+SACCADE_YCB names, or from the user's cache.
 """
 
 from __future__ import annotations
@@ -17,13 +18,13 @@ YCB_NAMES = ("002_master_chef_can", "003_cracker_box", "004_sugar_box", "005_tom
 
 
 def ycb_folder() -> Path:
-    """The folder that holds the YCB scans: SACCADE_YCB, else the user's cache."""
+    """The folder with the YCB scans: SACCADE_YCB if it is set, otherwise a folder in the user's cache."""
     cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
     return Path(os.environ.get("SACCADE_YCB", cache / "saccade" / "ycb"))
 
 
 def names_of(object_set: str) -> tuple[str, ...]:
-    """Names of the objects in a set. Raises SaccadeError for an unknown set."""
+    """The names of the objects in a set. Raises SaccadeError if the set is unknown."""
     if object_set == "ycb":
         return YCB_NAMES
     if object_set == "pantry":
@@ -32,7 +33,7 @@ def names_of(object_set: str) -> tuple[str, ...]:
 
 
 def load_mesh(object_set: str, name: str) -> Mesh:
-    """One mesh of a set. Raises SaccadeError for an unknown object and a missing or damaged file."""
+    """Loads one mesh of a set. Raises SaccadeError if the object is unknown, or if a file is missing or damaged."""
     if name not in names_of(object_set):
         raise SaccadeError(f"object {name!r} is not in {object_set!r}: choose from {', '.join(names_of(object_set))}")
     if object_set == "ycb":
@@ -41,7 +42,10 @@ def load_mesh(object_set: str, name: str) -> Mesh:
 
 
 def names_in_use(config: SceneConfig) -> tuple[str, ...]:
-    """The objects of the set, or the configured subset. Raises SaccadeError for a name that the set does not have."""
+    """The names of the objects that a run uses: all of the set, or the configured ones.
+
+    Raises SaccadeError if a name is not in the set or occurs twice, or if there is none.
+    """
     available = names_of(config.objects)
     for name in config.names or ():
         if name not in available:

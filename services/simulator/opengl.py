@@ -1,4 +1,4 @@
-"""Choosing an OpenGL that works without a screen, before MuJoCo is imported (it decides once, at import)."""
+"""Chooses an OpenGL backend that works without a screen. MuJoCo reads this choice once, when it is imported."""
 
 from __future__ import annotations
 
@@ -12,7 +12,10 @@ HOW_TO_MEND = ("no OpenGL without a screen: install libosmesa6 (Debian, Ubuntu: 
 
 
 def choose_backend() -> str:
-    """Sets MUJOCO_GL to osmesa or egl where the user has not chosen; raises SaccadeError where neither is there."""
+    """Sets the environment variable MUJOCO_GL to osmesa or egl, unless the user has set it. Returns its value.
+
+    Raises SaccadeError if neither of the two is installed.
+    """
     chosen = os.environ.get("MUJOCO_GL")
     if chosen:
         return chosen

@@ -1,8 +1,8 @@
-"""`pantry`, the built-in object set: five table-top things with the sizes of five YCB objects, made by code.
+"""`pantry`, the built-in object set: five groceries with the sizes of five YCB objects, made by code.
 
-Every object is a prism or a body of revolution: one outline scaled along a profile, a lid and a base. Its shape says
-little about its azimuth; its label differs all the way round, and so does its lid. Azimuth 0 (+x) is the front.
-The atlas holds the label that goes round (the whole width, at the top) and below it the lid and the base.
+Every object is an outline that is scaled along a vertical profile, with a lid and a base. Its shape says little about
+its azimuth. Its label and its lid look different from every azimuth. Azimuth 0 (+x) is the front. The texture atlas
+holds the label (at the top, over the whole width), and below it the lid and the base.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from saccade.services.simulator.mesh import Mesh
 
 PANTRY_NAMES = ("coffee_can", "cereal_box", "rice_box", "soup_can", "squeeze_bottle")
 ATLAS_PX = 1024
-_GUTTER_PX = 8  # around lid and base, filled with their edge, so that coarse mip levels do not mix regions
-_SEGMENTS = 56  # around a can; a multiple of 4, so that the extents are met exactly
-_FINE = 2  # art is drawn this many times larger, then averaged
+_GUTTER_PX = 8  # margin around lid and base in their edge's colour, so that coarse mip levels do not mix regions
+_SEGMENTS = 56  # segments around a can; a multiple of 4, so that the extents are exact
+_FINE = 2  # pictures are drawn larger by this factor and then averaged
 
 WHITE, BLACK, SILVER, GOLD = (248, 246, 240), (24, 22, 26), (186, 192, 200), (226, 172, 40)
 RED, ORANGE, YELLOW, CREAM = (206, 28, 36), (242, 120, 20), (252, 206, 24), (250, 234, 190)
@@ -28,11 +28,14 @@ PURPLE, PLUM, PINK, BROWN, TEAL = (112, 40, 150), (62, 18, 88), (238, 96, 156), 
 
 Colour = tuple[int, int, int]
 Rectangle = tuple[float, float, float, float, Colour]  # left, top, right, bottom
-Steps = Sequence[tuple[float, float]]  # up a profile: scale of the outline, height in metres
+Steps = Sequence[tuple[float, float]]  # points of a profile: scale of the outline, height in metres
 
 
 class Art:
-    """A picture in fractions of itself: x to the right, y down, both 0 to 1; radii and text sizes in heights."""
+    """A picture. Coordinates are fractions of it: x to the right, y down, both 0 to 1.
+
+    Radii and text sizes are fractions of its height.
+    """
 
     def __init__(self, width_px: int, height_px: int, colour: Colour):
         self.width, self.height = width_px * _FINE, height_px * _FINE
@@ -40,24 +43,24 @@ class Art:
         self.draw = ImageDraw.Draw(self.image)
 
     def rect(self, *rectangles: Rectangle) -> None:
-        """Filled rectangles, the later over the earlier."""
+        """Draws filled rectangles. A later one covers an earlier one."""
         for x0, y0, x1, y1, colour in rectangles:
             corners = (x0 * self.width, y0 * self.height, x1 * self.width - 1, y1 * self.height - 1)
             self.draw.rectangle(corners, fill=colour)
 
     def poly(self, points: ArrayLike, colour: Colour) -> None:
-        """A filled polygon of points [N, 2]."""
+        """Draws a filled polygon with corners [N, 2]."""
         scaled = np.asarray(points, dtype=np.float64) * (self.width, self.height)
         self.draw.polygon([tuple(p) for p in scaled.tolist()], fill=colour)
 
     def disc(self, x: float, y: float, r: float, colour: Colour, flat: float = 1.0,
              sector_deg: tuple[float, float] = (0, 360)) -> None:
-        """An ellipse `flat` times as tall as wide, or a sector of it (degrees clockwise from the right)."""
+        """Draws an ellipse, `flat` times as tall as wide, or a sector of it (degrees clockwise from the right)."""
         cx, cy, rx, ry = x * self.width, y * self.height, r * self.height, r * flat * self.height
         self.draw.pieslice((cx - rx, cy - ry, cx + rx, cy + ry), *sector_deg, fill=colour)
 
     def text(self, x: float, y: float, words: str, size: float, colour: Colour, turn_deg: float = 0.0) -> None:
-        """Bold words centred at (x, y), turned counter-clockwise."""
+        """Draws bold words centred at (x, y), turned counter-clockwise."""
         font = ImageFont.load_default(size=round(size * self.height))
         bold = max(1, round(size * self.height / 22))
         left, top, right, bottom = font.getbbox(words, stroke_width=bold)
@@ -68,7 +71,7 @@ class Art:
         self.image.paste(colour, corner, mask)
 
     def barcode(self, x0: float, y0: float, x1: float, y1: float, number: int = 0b1011001110100110111001011) -> None:
-        """A white panel with upright bars, one for each set bit of `number`."""
+        """Draws a white panel with vertical bars, one for each bit 1 of `number`."""
         self.rect((x0, y0, x1, y1, WHITE))
         bits, pad = f"{number:b}", 0.1
         edges = np.linspace(x0 + pad * (x1 - x0), x1 - pad * (x1 - x0), len(bits) + 1)
@@ -77,7 +80,7 @@ class Art:
                 self.rect((left, y0 + pad * (y1 - y0), right, y1 - pad * (y1 - y0), BLACK))
 
     def table(self, x0: float, y0: float, x1: float, y1: float, rows: int = 8) -> None:
-        """A white nutrition panel: a heading and lines of unequal length."""
+        """Draws a white nutrition table: a heading and lines of different lengths."""
         self.rect((x0, y0, x1, y1, WHITE))
         w, h = x1 - x0, (y1 - y0) / (rows + 2)
         self.rect((x0 + 0.08 * w, y0 + 0.4 * h, x0 + 0.92 * w, y0 + 1.4 * h, BLACK))
@@ -87,7 +90,7 @@ class Art:
             self.rect((x0 + 0.8 * w, y, x0 + 0.92 * w, y + 0.35 * h, BLACK))
 
     def bowl(self, x: float, y: float, r: float, colour: Colour, food: Colour, bits: Colour) -> None:
-        """A bowl seen from the front, its rim at y, full of food with bits in it."""
+        """Draws a bowl as seen from the front, with its rim at y, full of food with small pieces in it."""
         self.disc(x, y, r, colour, 0.95, (0, 180))
         self.disc(x, y, r, food, 0.34)
         for k in range(7):
@@ -95,7 +98,7 @@ class Art:
 
 
 def _ellipse(x_m: float, y_m: float) -> NDArray[np.float64]:
-    """Outline [_SEGMENTS + 1, 2] in metres of the given extents, counter-clockwise from azimuth -pi, closed."""
+    """A closed elliptic outline [_SEGMENTS + 1, 2] (metres) with these extents, counter-clockwise from azimuth -pi."""
     angle = np.linspace(-np.pi, np.pi, _SEGMENTS + 1)
     outline = np.stack([np.cos(angle) * x_m / 2, np.sin(angle) * y_m / 2], axis=1)
     outline[-1] = outline[0]
@@ -103,14 +106,14 @@ def _ellipse(x_m: float, y_m: float) -> NDArray[np.float64]:
 
 
 def _rectangle(x_m: float, y_m: float) -> NDArray[np.float64]:
-    """Outline [5, 2] in metres, counter-clockwise: front (+x), +y, back and -y side, closed."""
+    """A closed rectangular outline [5, 2] (metres), counter-clockwise: front (+x), +y side, back and -y side."""
     return np.array([(1, -1), (1, 1), (-1, 1), (-1, -1), (1, -1)]) * (x_m / 2, y_m / 2)
 
 
 class Shape:
-    """An outline [N, 2] (metres) carried up a profile [P, 2] of (scale of the outline, height in metres).
+    """An outline [N, 2] (metres) moved along a profile [P, 2] of (scale of the outline, height in metres).
 
-    The `sunk` metres by which lid and base lie below the rim make a recess; the label covers the outside only.
+    Lid and base lie `sunk` metres inside the rim. The label covers the outside only.
     """
 
     def __init__(self, outline: NDArray[np.float64], profile: ArrayLike, sunk: float = 0.0):
@@ -127,11 +130,11 @@ class Shape:
         self.corners_px = [(_GUTTER_PX + x, self.label_px + _GUTTER_PX) for x in (0, ATLAS_PX // 2)]  # lid, base
 
     def arts(self, label: Colour, lid: Colour) -> tuple[Art, Art]:
-        """Blank label and lid."""
+        """An empty label and an empty lid in these colours."""
         return Art(ATLAS_PX, self.label_px, label), Art(*self.lid_px, lid)
 
     def _skin(self, steps: Steps) -> tuple[NDArray, NDArray]:
-        """Vertices [V, 3] of the outline at (scale, height) steps [S, 2], and faces [F, 3] between them."""
+        """Vertices [V, 3] of the outline at each of the steps (scale, height) [S, 2], and the faces [F, 3] between."""
         columns = len(self.outline)
         points = np.concatenate([np.c_[self.outline * scale, np.full(columns, z)] for scale, z in steps])
         low = (np.arange(len(steps) - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
@@ -140,13 +143,13 @@ class Shape:
         return points, faces[(a != b).any(1) & (b != c).any(1) & (c != a).any(1)]
 
     def _side(self) -> tuple[NDArray, NDArray, NDArray]:
-        """Vertices [V, 3], their pixels in the atlas [V, 2] and faces [F, 3] of the outside."""
+        """The outside: vertices [V, 3], their pixels in the atlas [V, 2], and faces [F, 3]."""
         points, faces = self._skin(self.profile.tolist())
         u, t = np.tile(self.u, len(self.t)), np.repeat(self.t, len(self.u))
         return points, np.c_[u * ATLAS_PX, (1 - t) * self.label_px], faces
 
     def _end(self, which: int) -> tuple[NDArray, NDArray, NDArray]:
-        """The same of the lid (0) or base (1): a rim and a recess where it is sunk, then a fan to the centre."""
+        """The lid (0) or the base (1), in the same form: a rim and a recess if it is sunk, and a fan to the centre."""
         sign, (scale, z) = (1, self.profile[-1]) if which == 0 else (-1, self.profile[0])
         inner = z - sign * self.sunk
         rim = [(0.95 * scale, z), (0.93 * scale, inner)] if self.sunk else []
@@ -155,9 +158,9 @@ class Shape:
         return points, self.corners_px[which] + across * self.lid_px, faces[:, ::sign]
 
     def mesh(self, name: str, label: Art, lid: Art) -> Mesh:
-        """Closed mesh wearing the art; the base, never seen on a table, gets a plain two-coloured one."""
+        """The closed mesh with this label and lid. The base is plain, because it is never seen on a table."""
         pixel, base = label.image.getpixel((0, 0)), Art(*self.lid_px, SILVER)
-        assert isinstance(pixel, tuple)  # as in every colour image
+        assert isinstance(pixel, tuple)  # true for every colour image
         red, green, blue = pixel
         ground = red, green, blue
         base.rect((0, 0, 0.5, 1, ground))
@@ -324,5 +327,5 @@ _MAKERS = dict(zip(PANTRY_NAMES, (_coffee_can, _cereal_box, _rice_box, _soup_can
 
 
 def make_mesh(name: str) -> Mesh:
-    """One object of the set, the same at every call. Raises KeyError for a name not in PANTRY_NAMES."""
+    """Makes one object of the set, the same at every call. Raises KeyError if the name is not in PANTRY_NAMES."""
     return _MAKERS[name]()

@@ -1,6 +1,7 @@
-"""Scenes: what stands where and which view is the goal. Read from a file, or drawn by the paper's rules.
+"""Scenes: which objects stand where, and which view is the goal.
 
-A file is JSON: `{"scenes": [...]}`, one map per scene with the keys of SCENE_KEYS; metres, radians, table top at z = 0.
+A scene is read from a file, or drawn by the paper's rules (section 4.1). A file is JSON, `{"scenes": [...]}`, with one
+map per scene. Its keys are those of SCENE_KEYS. Units are metres and radians, and the table top is at z = 0.
 """
 
 from __future__ import annotations
@@ -23,20 +24,20 @@ from saccade.shared.world.task import GOAL_CLEARANCE_M, clip, spheres_around
 PAPER_SCENES = Path(__file__).parent / "scenes" / "paper_500.json"
 SCENE_KEYS = {"id", "target", "table_rgb", "objects", "goal_world_from_camera"}
 OBJECT_KEYS = {"name", "center_xyz_m", "yaw_rad"}
-HALF_SPREAD_M = 0.25  # objects stand in [-0.25, 0.25]^2
+HALF_SPREAD_M = 0.25  # objects stand in the square [-0.25, 0.25]^2
 GOAL_RANGE_MAX_M = 0.50
 MAX_FILE_BYTES, MAX_SCENES = 64 * MIB, 20_000
 MAX_ID = 256  # characters of an id or a name: it is in messages and in file names
 MAX_NUMBERS = {"center_xyz_m": 10.0, "goal_world_from_camera": 10.0, "yaw_rad": 1e4}  # what is further is not seen
 _NEED = "give a scenes file"
-_TRIES = 100  # per object, before the whole table is cleared and laid anew
+_TRIES = 100  # attempts to place an object before all objects are placed anew, and how often this is done
 
 Sizes = Mapping[str, ArrayLike]  # name -> extents [3] of the object's box, metres
 
 
 @dataclass(frozen=True)
 class Placed:
-    """An object on the table: centre of its box [3] in metres, and its yaw in radians."""
+    """An object on the table: the centre of its box [3] (metres, world) and its yaw (radians)."""
 
     name: str
     center_m: NDArray[np.float64]
@@ -45,9 +46,9 @@ class Placed:
 
 @dataclass(frozen=True)
 class Scene:
-    """One episode's world. `table_rgb` 0 to 255; `goal_world_from_camera` [4, 4].
+    """The world of one episode. `table_rgb` is from 0 to 255; `goal_world_from_camera` [4, 4] is the goal view's pose.
 
-    With `target_absent` the target's place serves the goal image alone: it does not stand on the table.
+    With `target_absent` the target does not stand on the table. Its position is then used for the goal image only.
     """
 
     id: str
@@ -59,19 +60,19 @@ class Scene:
 
     @property
     def target_placed(self) -> Placed:
-        """The target and its place."""
+        """The target and its position."""
         return next(placed for placed in self.objects if placed.name == self.target)
 
     @property
     def on_table(self) -> tuple[Placed, ...]:
-        """What the camera can meet."""
+        """The objects that stand on the table."""
         return tuple(p for p in self.objects if not (self.target_absent and p.name == self.target))
 
 
 def load_scenes(path: Path, names: Sequence[str] | None = None) -> list[Scene]:
-    """The scenes of a file, checked; with `names`, no other object may occur.
+    """Reads and checks the scenes of a file. With `names` no other object may occur in them.
 
-    Raises SaccadeError, in one line with the file and the scene, for anything missing, damaged or contradictory.
+    Raises SaccadeError, in one line with the file and the scene, if anything is missing, damaged or contradictory.
     """
     text = read_text(path, "scenes", _NEED, MAX_FILE_BYTES)
     try:
@@ -173,7 +174,7 @@ def _has_shape(value: Any, shape: tuple[int, ...]) -> bool:
 
 
 def save_scenes(path: Path, scenes: Sequence[Scene]) -> None:
-    """Writes scenes that load_scenes reads back."""
+    """Writes scenes to a file that `load_scenes` can read."""
     entries = []
     for scene in scenes:
         entry: dict[str, Any] = {
@@ -189,9 +190,10 @@ def save_scenes(path: Path, scenes: Sequence[Scene]) -> None:
 
 def generate_scene(rng: np.random.Generator, sizes: Sizes, target: str, n_objects: int, *,
                    yaw: Literal["random", "fixed"] = "random", scene_id: str = "drawn") -> Scene:
-    """Draws a scene as the benchmark's generator does (paper, section 4.1), with `n_objects` distinct objects.
+    """Draws a scene with `n_objects` different objects, as the benchmark's generator does (paper, section 4.1).
 
-    `yaw="fixed"` is the paper's: objects are never turned. Raises SaccadeError for more objects than there are.
+    With `yaw="fixed"` no object is turned, as in the paper. Raises SaccadeError if the target is unknown, if there are
+    not so many objects, or if they do not fit on the table.
     """
     if target not in sizes:
         raise SaccadeError(f"target {target!r} is not among the objects: choose from {', '.join(sizes)}")
@@ -211,7 +213,10 @@ def generate_scene(rng: np.random.Generator, sizes: Sizes, target: str, n_object
 
 
 def draw_goal(rng: np.random.Generator, centers_m: ArrayLike, sizes_m: ArrayLike, index: int) -> NDArray[np.float64]:
-    """A goal view [4, 4] of object `index` of those with box centres [N, 3] and extents [N, 3] (paper, section 4.1)."""
+    """Draws a goal view world_from_camera [4, 4] of object `index` (paper, section 4.1).
+
+    The objects have box centres [N, 3] and extents [N, 3] (metres).
+    """
     centers, extents = np.asarray(centers_m, dtype=np.float64), np.asarray(sizes_m, dtype=np.float64)
     azimuth, elevation = rng.uniform(0, 2 * np.pi), rng.uniform(0, np.pi / 2)
     nearest = min(float(np.linalg.norm(extents[index])) / 2 + GOAL_CLEARANCE_M, GOAL_RANGE_MAX_M)
@@ -222,7 +227,10 @@ def draw_goal(rng: np.random.Generator, centers_m: ArrayLike, sizes_m: ArrayLike
 
 
 def _spread(rng: np.random.Generator, radii_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Points xy [N, 2] whose circles do not overlap; starts over where the last object finds no room."""
+    """Draws points xy [N, 2] (metres) whose circles do not overlap. It starts again if an object finds no room.
+
+    Raises SaccadeError if this fails too often.
+    """
     for _ in range(_TRIES):
         points: list[NDArray[np.float64]] = []
         for radius in radii_m:
@@ -239,7 +247,10 @@ def _spread(rng: np.random.Generator, radii_m: NDArray[np.float64]) -> NDArray[n
 def generate_split(sizes: Sizes, *, seed: int, targets: Sequence[str] | None = None,
                    counts: Sequence[int] = (1, 2, 3, 4, 5), repeats: int = 20,
                    yaw: Literal["random", "fixed"] = "random") -> list[Scene]:
-    """A split like the paper's: targets x counts x repeats. The same arguments draw the same scenes."""
+    """Draws a split like the paper's: `repeats` scenes for each target and each number of objects.
+
+    The same arguments draw the same scenes. Raises SaccadeError as `generate_scene` does.
+    """
     scenes: list[Scene] = []
     for target in targets if targets is not None else tuple(sizes):
         for count in counts:
@@ -251,7 +262,7 @@ def generate_split(sizes: Sizes, *, seed: int, targets: Sequence[str] | None = N
 
 
 def overlapping(scene: Scene, sizes: Sizes) -> list[tuple[str, str]]:
-    """Pairs of objects whose bounding circles overlap; empty for every generated scene."""
+    """The pairs of objects whose bounding circles on the table overlap. A generated scene has none."""
     radius = {p.name: np.linalg.norm(np.asarray(sizes[p.name], dtype=np.float64)[:2]) / 2 for p in scene.objects}
     return [(a.name, b.name) for a, b in combinations(scene.objects, 2)
             if np.linalg.norm((a.center_m - b.center_m)[:2]) < radius[a.name] + radius[b.name] - 1e-9]

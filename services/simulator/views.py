@@ -1,4 +1,4 @@
-"""Views of single objects for training: tight square tiles on black, with coverage, from shells around the object."""
+"""Views of single objects for training: square tiles on black, with coverage, from several ranges ("shells")."""
 
 from __future__ import annotations
 
@@ -17,9 +17,10 @@ RENDER_PX, TILE_PX = 256, 128
 
 @dataclass(frozen=True)
 class ObjectViews:
-    """Tiles [S, N, T, T, 4] uint8 (rgb premultiplied by coverage, coverage) of S shells and N directions.
+    """Tiles [S, N, T, T, 4] uint8 of one object, from S ranges ("shells") and N directions.
 
-    azimuth_rad [N], elevation_rad [N]; a tile spans crop_side_m at the object's centre; size_m [3] is the object's box.
+    A tile holds RGB, premultiplied by the coverage, and the coverage. azimuth_rad [N] and elevation_rad [N] are the
+    directions. A tile is crop_side_m wide at the object's centre. size_m [3] are the extents of the object's box.
     """
 
     name: str
@@ -32,19 +33,22 @@ class ObjectViews:
 
 
 def crop_side_m(size_m: NDArray[np.float64]) -> float:
-    """Side of the square around an object that its crop covers: the box's diagonal and a margin for perspective."""
+    """Side (m) of the square around an object that its crop covers: the box's diagonal and a margin for perspective."""
     return float(1.1 * np.linalg.norm(size_m))
 
 
 def default_shells_m(size_m: NDArray[np.float64]) -> tuple[float, ...]:
-    """As near as the camera may come, the paper's 0.40 m, and two more that teach perspective."""
+    """Ranges (m) of the views: the nearest that is allowed, the paper's 0.40 m, and two that teach perspective."""
     return (float(np.linalg.norm(size_m)) / 2 + 0.08, 0.28, REFERENCE_RANGE_M, 0.75)
 
 
 def render_views(mesh: Mesh, *, count: int = 500, shells_m: tuple[float, ...] | None = None,
                  progress: Callable[[int], None] = lambda done: None) -> ObjectViews:
-    """Renders `count` views on a Fibonacci hemisphere (paper, appendix B) from every shell; the camera looks at the
-    centre, and its field of view just holds the crop. `progress` hears the number of views done."""
+    """Renders `count` views on a Fibonacci hemisphere (paper, appendix B) from each range.
+
+    The camera looks at the object's centre, and its field of view is that of the crop. `progress` is called with the
+    number of views that are done.
+    """
     shells_m = shells_m or default_shells_m(mesh.size_m)
     side = crop_side_m(mesh.size_m)
     azimuth, elevation = fibonacci_hemisphere(count)

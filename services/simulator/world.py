@@ -1,4 +1,4 @@
-"""The table, the objects and the camera in MuJoCo: poses in, images out. No physics runs; nothing moves by itself."""
+"""The table, the objects and the camera in MuJoCo, which renders images. No physics runs: nothing moves by itself."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from saccade.shared.world.geometry import IMAGE_SIZE_PX, INTRINSICS_PX
 choose_backend()
 try:
     import mujoco
-except (ImportError, AttributeError, OSError) as error:  # PyOpenGL raises AttributeError where the library is absent
+except (ImportError, AttributeError, OSError) as error:  # PyOpenGL raises AttributeError if the library is missing
     raise SaccadeError(f"{HOW_TO_MEND} ({error})") from error
 
 TABLE_SIDE_M = 1.0
@@ -24,7 +24,7 @@ _OUT_OF_SIGHT = np.array([0.0, 0.0, -100.0])
 
 
 def _build(meshes: tuple[Mesh, ...]) -> mujoco.MjModel:
-    """Compiles the model: every body is a mocap body, so a new scene needs no compilation."""
+    """Compiles the model. Every body is a mocap body, so that a new scene needs no compilation."""
     spec = mujoco.MjSpec()
     spec.stat.extent, spec.stat.center = 1.0, [0, 0, 0]
     spec.visual.map.znear, spec.visual.map.zfar = NEAR_M, FAR_M
@@ -39,7 +39,7 @@ def _build(meshes: tuple[Mesh, ...]) -> mujoco.MjModel:
     for mesh in meshes:
         _add_object(spec, mesh)
     model = spec.compile()
-    for mesh in meshes:  # the specification takes texels one Python number at a time; the compiled model an array
+    for mesh in meshes:  # faster than in the specification, which takes texels as single Python numbers
         start = model.tex_adr[model.tex(mesh.name).id]
         model.tex_data[start:start + mesh.texture.size] = np.flipud(mesh.texture).ravel()
     return model
@@ -59,7 +59,11 @@ def _add_object(spec: mujoco.MjSpec, mesh: Mesh) -> None:
 
 
 class World:
-    """A scene that can be rendered. Not shared between threads: the OpenGL context belongs to its creator."""
+    """A scene that can be rendered.
+
+    It must not be shared between threads, because the OpenGL context belongs to the thread that creates it. Raises
+    SaccadeError if OpenGL does not work.
+    """
 
     def __init__(self, meshes: tuple[Mesh, ...], *, size_px: int = IMAGE_SIZE_PX,
                  intrinsics_px: ArrayLike = INTRINSICS_PX):
@@ -73,20 +77,23 @@ class World:
             self.renderer = mujoco.Renderer(self.model, height=size_px, width=size_px)
         except Exception as error:  # each OpenGL platform raises its own class
             raise SaccadeError(f"{HOW_TO_MEND} ({error})") from error
-        weakref.finalize(self, self.renderer.close)  # before the interpreter takes OpenGL apart
+        weakref.finalize(self, self.renderer.close)  # closes it before the interpreter unloads OpenGL
         self.set_intrinsics(intrinsics_px)
         self.place({})
 
     def set_intrinsics(self, intrinsics_px: ArrayLike) -> None:
-        """(fx, fy, cx, cy) in pixels of the rendered image; cx, cy from its top left corner."""
+        """Sets (fx, fy, cx, cy), in pixels of the rendered image. cx and cy are counted from its top left corner."""
         fx, fy, cx, cy = np.asarray(intrinsics_px, dtype=np.float64) / self.size_px
-        # a sensor of 1 x 1 m, so that metres on it are fractions of the image; MuJoCo shifts the sensor, not the image
+        # The sensor is 1 x 1 m, so metres on it are fractions of the image. MuJoCo shifts the sensor, not the image.
         self.model.cam_sensorsize[0] = (1.0, 1.0)
         self.model.cam_intrinsic[0] = (fx, fy, 0.5 - cx, 0.5 - cy)
         self.intrinsics_px = np.asarray(intrinsics_px, dtype=np.float64)
 
     def place(self, poses: dict[str, tuple[ArrayLike, float]], table_rgb: ArrayLike = (128, 128, 128)) -> None:
-        """Puts objects at (box centre [3] in metres, yaw in radians); those not named are out of sight."""
+        """Puts objects at (box centre [3] in metres, yaw in radians). Objects that are not named are out of sight.
+
+        `table_rgb` is from 0 to 255.
+        """
         self.poses = dict(poses)
         self.model.geom("table").rgba[:3] = np.asarray(table_rgb) / 255.0
         for name, mocap in self._mocap.items():
@@ -95,7 +102,7 @@ class World:
             self.data.mocap_quat[mocap] = (np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2))
 
     def show_table(self, visible: bool) -> None:
-        """Draws the table or leaves it out (object views of the training set have a black background)."""
+        """Shows or hides the table. It is hidden in the views of the training set, which have a black background."""
         self.model.geom("table").rgba[3] = float(visible)
 
     def _prepare(self, world_from_camera: ArrayLike) -> None:
@@ -107,12 +114,12 @@ class World:
         self.renderer.update_scene(self.data, camera="camera")
 
     def render(self, world_from_camera: ArrayLike) -> NDArray[np.uint8]:
-        """RGB image [H, W, 3] from a camera pose [4, 4]."""
+        """Renders the RGB image [H, W, 3] from a camera pose world_from_camera [4, 4]."""
         self._prepare(world_from_camera)
         return self.renderer.render().copy()
 
     def render_depth(self, world_from_camera: ArrayLike) -> NDArray[np.float32]:
-        """Depth along the optical axis [H, W] in metres; beyond the far plane it is FAR_M."""
+        """Renders the depth along the optical axis [H, W] in metres. Beyond the far plane it is FAR_M."""
         self.renderer.enable_depth_rendering()
         try:
             self._prepare(world_from_camera)
@@ -121,7 +128,7 @@ class World:
             self.renderer.disable_depth_rendering()
 
     def render_masks(self, world_from_camera: ArrayLike) -> dict[str, NDArray[np.bool_]]:
-        """For every placed object, the pixels [H, W] where it is seen."""
+        """Renders a mask [H, W] for every placed object: the pixels in which it is seen."""
         self.renderer.enable_segmentation_rendering()
         try:
             self._prepare(world_from_camera)
