@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-import errno
 import os
-import resource
-import socket
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -18,48 +13,8 @@ from saccade.shared.config import MAX_FILE_BYTES, Config, load, recorded
 from saccade.shared.errors import LINE_LIMIT, SaccadeError, printable, told
 from saccade.shared.files import opened, parse_json, parse_toml, read_text
 from saccade.tests.front_door import call
+from saccade.tests.hostile import MANY, complaint, full_disk, not_files, sparse, within_limits
 from saccade.tests.test_picture import write_log
-
-MANY, BYTES, SECONDS = 100_000, 3 * 2 ** 30, 20
-
-
-def complaint(action, *arguments, **options) -> str:
-    """The one line in which it is refused."""
-    with pytest.raises(SaccadeError) as caught:
-        action(*arguments, **options)
-    text = str(caught.value)
-    assert text.isprintable()
-    assert len(text) <= LINE_LIMIT + 5
-    return text
-
-
-def within_limits(code: str, *arguments: object) -> str:
-    """What a program prints that may use BYTES of address space and SECONDS of processor time."""
-    def limit() -> None:
-        resource.setrlimit(resource.RLIMIT_AS, (BYTES, BYTES))
-        resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
-
-    done = subprocess.run([sys.executable, "-c", code, *map(str, arguments)], capture_output=True, text=True,
-                          preexec_fn=limit)
-    assert done.returncode == 0, done.stderr[-500:]
-    return done.stdout
-
-
-def sparse(path: Path, size: int) -> Path:
-    """A file that says it is large and takes no room."""
-    with path.open("wb") as file:
-        file.truncate(size)
-    return path
-
-
-def not_files(folder: Path, suffix: str = "") -> dict[str, Path]:
-    """What is no regular file, and would block whoever opens it to read."""
-    fifo, listening = folder / f"fifo{suffix}", folder / f"socket{suffix}"
-    os.mkfifo(fifo)
-    with socket.socket(socket.AF_UNIX) as end:
-        end.bind(str(listening))
-    return {"a FIFO": fifo, "a socket": listening, "a device": Path("/dev/zero"), "a folder": folder}
-
 
 # Texts from outside, as they are printed.
 
@@ -194,10 +149,6 @@ def test_a_configuration_that_is_not_written_leaves_the_old_one(tmp_path, monkey
     assert "No space left on device" in complaint(Config(seed=2).save, tmp_path / "config.json")
     assert load(tmp_path / "config.json").seed == 1
     assert os.listdir(tmp_path) == ["config.json"]
-
-
-def full_disk(*_arguments, **_options):
-    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 BROKEN = {"zeros": "\0" * 1000, "no JSON": "seed = 1", "deep": "[" * MANY, "a list": "[]", "unknown": '{"a": 1}',

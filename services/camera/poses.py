@@ -9,10 +9,11 @@ Blank lines, and lines that begin with #, are ignored.
 
 from __future__ import annotations
 
-import json
+import io
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,12 +22,16 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation, Slerp
 
 from saccade.services.camera.sources import SourceImage
-from saccade.shared.errors import SaccadeError
+from saccade.shared.errors import SaccadeError, printable, told
+from saccade.shared.files import MIB, parse_json, read_text
 from saccade.shared.world.geometry import Array, pose
 
 Convention = Literal["opengl", "opencv"]  # the camera looks along -z with +y up, or along +z with +y down
 Key = tuple[str, str | int | float | None]  # how a pose is assigned (image, index, time_s or still), and the value
 
+MAX_FILE_BYTES, MAX_POSES, MAX_LINE = 64 * MIB, 500_000, 4096
+MAX_M = 1e5  # from the origin: nothing is seen from further away
+_NEED = "give JSON lines or the TUM format"
 MAX_GAP_S = 1.0  # poses are not interpolated across a longer gap, because the camera's path there is unknown
 HOLD_S = 0.1  # a pose also holds for images this long before and after it
 ORTHONORMAL = 1e-3  # largest error of R^T R that is accepted: poses are written with four digits or more
@@ -88,7 +93,7 @@ class Poses:
         return self.table["time_s", nearest] if abs(nearest - time_s) <= HOLD_S else None
 
     def __str__(self) -> str:
-        parts = [f"{len(keys)} by {kind}, {keys[0]} to {keys[-1]}"
+        parts = [f"{len(keys)} by {kind}, {printable(str(keys[0]), 100)} to {printable(str(keys[-1]), 100)}"
                  for kind in ("image", "index", "time_s") if (keys := self._keys(kind))]
         return f"{self.name} ({'; '.join(parts)})"
 
@@ -107,7 +112,7 @@ def read_poses(path: Path, convention: Convention | None = None) -> Poses:
         try:
             key, world_from_camera = _json_line(line) if is_json else _tum_line(line)
             if key in table:
-                raise ValueError(f"a second pose for {key[0]} {key[1]}")
+                raise ValueError(f"a second pose for {key[0]} {printable(str(key[1]), 100)}")
             if table and STILL in (key, *table):
                 raise ValueError("a pose without image, index or time_s holds for all images: give no other pose")
         except (ValueError, OverflowError) as error:
@@ -118,21 +123,21 @@ def read_poses(path: Path, convention: Convention | None = None) -> Poses:
 
 def _lines(path: Path) -> list[tuple[int, str]]:
     """The lines that are neither blank nor comments, with their numbers. Raises SaccadeError if there are none."""
-    try:
-        lines = [(n, line.strip()) for n, line in enumerate(path.read_text().splitlines(), start=1)]
-    except OSError as error:
-        raise SaccadeError(f"poses {path} cannot be read: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise SaccadeError(f"poses {path} is not a text: give JSON lines or the TUM format") from error
-    lines = [(n, line) for n, line in lines if line and not line.startswith("#")]
+    text = io.StringIO(read_text(path, "poses", _NEED, MAX_FILE_BYTES))
+    numbered = enumerate(map(str.strip, text), start=1)
+    lines = list(islice(((n, line) for n, line in numbered if line and not line.startswith("#")), MAX_POSES + 1))
     if not lines:
-        raise SaccadeError(f"poses {path} holds no pose: give JSON lines or the TUM format")
+        raise SaccadeError(f"poses {path} holds no pose: {_NEED}")
+    if len(lines) > MAX_POSES:
+        raise SaccadeError(f"poses {path} holds more than {MAX_POSES} poses: leave out what no image needs")
+    if too_long := next((n for n, line in lines if len(line) > MAX_LINE), None):
+        raise SaccadeError(f"poses {path}:{too_long}: a line of more than {MAX_LINE} characters: {_NEED}")
     return lines
 
 
 def _json_line(line: str) -> tuple[Key, Array]:
     try:
-        tree: Any = json.loads(line)
+        tree: Any = parse_json(line)
     except ValueError as error:
         raise ValueError(f"not JSON ({error})") from error
     if not isinstance(tree, dict) or "world_from_camera" not in tree or len(tree) > 2:
@@ -140,11 +145,13 @@ def _json_line(line: str) -> tuple[Key, Array]:
     kind, value = next(((k, v) for k, v in tree.items() if k != "world_from_camera"), STILL)
     kinds: dict[str, Any] = {"image": str, "index": int, "time_s": (int, float), "still": type(None)}
     if kind not in kinds:
-        raise ValueError(f"unknown key {kind!r}: give one of image, index and time_s")
+        raise ValueError(f"unknown key {told(kind)}: give one of image, index and time_s")
     if not isinstance(value, kinds[kind]) or isinstance(value, bool):
-        raise ValueError(f"{kind}: {value!r} is not a {'text' if kind == 'image' else 'number'}")
+        raise ValueError(f"{kind}: {told(value)} is not a {'text' if kind == 'image' else 'number'}")
     if kind == "time_s" and not math.isfinite(value):
         raise ValueError(f"time_s: {value} is not finite")
+    if kind == "index" and not 0 <= value < 2 ** 63:
+        raise ValueError("index: no image has such a number")
     return (kind, value), rigid(tree["world_from_camera"])
 
 
@@ -157,6 +164,8 @@ def _tum_line(line: str) -> tuple[Key, Array]:
         raise ValueError("neither a JSON object nor the eight numbers of TUM: timestamp tx ty tz qx qy qz qw")
     if not np.isfinite([time_s, *rest]).all():
         raise ValueError("not finite")
+    if max(map(abs, rest)) > MAX_M:
+        raise ValueError(f"a number beyond {MAX_M:g}")
     length = float(np.linalg.norm(rest[3:]))
     if abs(length - 1.0) > UNIT_QUATERNION:
         raise ValueError(f"the quaternion has length {length:.3f}, not 1")
@@ -173,6 +182,8 @@ def rigid(matrix: ArrayLike) -> Array:
         raise ValueError("world_from_camera is not 4x4 numbers")
     if not np.isfinite(transform).all():
         raise ValueError("world_from_camera is not finite")
+    if np.abs(transform).max() > MAX_M:
+        raise ValueError(f"world_from_camera has a number beyond {MAX_M:g}")
     if not np.allclose(transform[3], (0, 0, 0, 1), atol=1e-9):
         raise ValueError("world_from_camera does not end in the row 0 0 0 1: is it transposed?")
     rotation = transform[:3, :3]

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from saccade.shared.errors import SaccadeError
 from saccade.shared.world.images import Size, image_size, read_image
 
+MAX_IMAGES, MAX_ENTRIES = 100_000, 1_000_000  # of a folder
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 DEFAULT_RATE_HZ = 10.0
 MAX_RATE_HZ = 1000.0  # a higher frame rate in a video's header is not believed
@@ -63,11 +64,12 @@ def open_source(text: str, *, rate_hz: float = DEFAULT_RATE_HZ) -> Source:
     if number is not None:
         return Webcam(number, rate_hz)
     path = Path(text)
-    if path.is_dir():
+    if os.path.isdir(path):
         return Folder(path, rate_hz)
     need = "give a folder of images, a video file, or a webcam such as webcam:0"
-    if not path.is_file():
-        raise SaccadeError(f"camera source {text} is not there: {need}")
+    if not os.path.isfile(path):
+        what = "is neither a folder nor a file" if os.path.exists(path) else "is not there"
+        raise SaccadeError(f"camera source {text} {what}: {need}")
     if path.suffix.lower() in IMAGE_SUFFIXES:
         raise SaccadeError(f"camera source {text} is a single image: give the folder that it is in")
     return Video(path, rate_hz)
@@ -94,11 +96,7 @@ class Folder:
 
     def __init__(self, path: Path, rate_hz: float = DEFAULT_RATE_HZ):
         self.name, self.period_s = str(path), 1.0 / rate_hz
-        try:
-            found = [p for p in path.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".")]
-        except OSError as error:
-            raise SaccadeError(f"folder {path} cannot be read: {error.strerror}") from error
-        self.paths = sorted(found, key=_natural)
+        self.paths = sorted(_images_in(path), key=_natural)
         if not self.paths:
             raise SaccadeError(f"folder {path} holds no image: put PNG or JPEG files into it")
         self.size_px = _common_size(self.paths)
@@ -106,6 +104,22 @@ class Folder:
     def __iter__(self) -> Iterator[SourceImage]:
         for index, path in enumerate(self.paths):
             yield SourceImage(read_image(path), index, index * self.period_s, path.name)
+
+
+def _images_in(folder: Path) -> list[Path]:
+    """The paths that look like images, in no order. Raises SaccadeError for a folder that has too many entries."""
+    found: list[Path] = []
+    try:
+        with os.scandir(folder) as entries:
+            for count, entry in enumerate(entries, start=1):
+                if entry.name.lower().endswith(IMAGE_SUFFIXES) and not entry.name.startswith("."):
+                    found.append(folder / entry.name)
+                if len(found) > MAX_IMAGES or count > MAX_ENTRIES:
+                    raise SaccadeError(f"folder {folder} holds more than {MAX_IMAGES} images or {MAX_ENTRIES} entries: "
+                                       "give a part of them in a folder of its own")
+    except OSError as error:
+        raise SaccadeError(f"folder {folder} cannot be read: {error.strerror}") from error
+    return found
 
 
 def _natural(path: Path) -> tuple[list[str | int], str]:

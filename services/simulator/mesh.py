@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
+import io
+import os
+from array import array
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from saccade.shared.errors import SaccadeError
+from saccade.shared.files import MIB, opened
+from saccade.shared.world.images import opened_image
+
+MAX_FILE_BYTES = 64 * MIB
+MAX_COUNT = 1_000_000  # of faces, of vertices and of texture coordinates: a scan has some ten thousand
+MAX_COORDINATE = 1e4
 
 TEXTURE_MAX_PX = 2048  # with a larger texture a texel would be far smaller than a pixel, even in the nearest view
 
@@ -39,34 +49,54 @@ def read_obj(folder: Path, name: str) -> Mesh:
     Raises SaccadeError, with the path and what to do, if a file is missing or damaged.
     """
     path = folder / "textured.obj"
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise SaccadeError(f"mesh {path} is missing: set SACCADE_YCB to a folder with {name}/textured.obj in it")
     try:
-        vertices, texcoords, faces = _parse_obj(path.read_text().splitlines())
-    except (ValueError, IndexError, UnicodeDecodeError) as error:
+        with opened(path, "mesh", "fetch it again", MAX_FILE_BYTES) as stream:
+            vertices, texcoords, faces = _parse_obj(io.TextIOWrapper(stream, encoding="utf-8"))
+    except (ValueError, OverflowError) as error:
         raise SaccadeError(f"mesh {path} is damaged ({error}): fetch it again") from error
     vertices -= (vertices.max(0) + vertices.min(0)) / 2
     return Mesh(name, vertices, texcoords, faces, read_texture(folder))
 
 
-def _parse_obj(lines: list[str]) -> tuple[NDArray, NDArray, NDArray]:
+def _parse_obj(lines: Iterable[str]) -> tuple[NDArray, NDArray, NDArray]:
     """Parses triangles with texture coordinates from the lines of a Wavefront OBJ file.
 
     Returns vertices [V, 3], texture coordinates [V, 2] and faces [F, 3], with one output vertex for each distinct pair
     of a vertex and a texture coordinate. Raises ValueError or IndexError if the file is damaged.
     """
-    positions = np.array([line.split()[1:4] for line in lines if line.startswith("v ")], dtype=np.float32)
-    coords = np.array([line.split()[1:3] for line in lines if line.startswith("vt ")], dtype=np.float32)
-    corners = np.array([[c.split("/")[:2] for c in line.split()[1:]] for line in lines if line.startswith("f ")],
-                       dtype=np.int64) - 1
-    if corners.ndim != 3 or corners.shape[1:] != (3, 2) or len(positions) == 0:
+    numbers, texels, indices = array("d"), array("d"), array("q")
+    for line in lines:
+        if line.startswith("v "):
+            numbers.extend(_exactly(3, [float(word) for word in line.split(None, 4)[1:4]]))
+        elif line.startswith("vt "):
+            texels.extend(_exactly(2, [float(word) for word in line.split(None, 3)[1:3]]))
+        elif line.startswith("f "):
+            words = _exactly(3, line.split(None, 4)[1:])
+            indices.extend(int(index) for word in words for index in _exactly(2, word.split("/", 2)[:2]))
+        if len(numbers) > 3 * MAX_COUNT or len(texels) > 2 * MAX_COUNT or len(indices) > 6 * MAX_COUNT:
+            raise ValueError(f"it has more than {MAX_COUNT} vertices or faces")
+    positions, coords = np.array(numbers).reshape(-1, 3), np.array(texels).reshape(-1, 2)
+    corners = np.array(indices).reshape(-1, 3, 2)
+    if len(corners) == 0 or len(positions) == 0:
         raise ValueError("no textured triangles in it")
-    if corners.min() < 0 or corners[..., 0].max() >= len(positions) or corners[..., 1].max() >= len(coords):
+    if corners.min() < 1 or corners[..., 0].max() > len(positions) or corners[..., 1].max() > len(coords):
         raise ValueError("a face refers to a vertex that is not there")
+    corners -= 1  # they count from 1
     if not (np.isfinite(positions).all() and np.isfinite(coords).all()):
         raise ValueError("a coordinate is not finite")
+    if max(np.abs(positions).max(), np.abs(coords).max()) > MAX_COORDINATE:
+        raise ValueError(f"a coordinate is beyond {MAX_COORDINATE:g}")
+    positions, coords = positions.astype(np.float32), coords.astype(np.float32)
     pairs, inverse = np.unique(corners.reshape(-1, 2), axis=0, return_inverse=True)
     return positions[pairs[:, 0]], coords[pairs[:, 1]], inverse.reshape(-1, 3).astype(np.int32)
+
+
+def _exactly(count: int, words: list) -> list:
+    if len(words) != count:
+        raise ValueError("no textured triangles in it")
+    return words
 
 
 def read_texture(folder: Path) -> NDArray[np.uint8]:
@@ -75,11 +105,14 @@ def read_texture(folder: Path) -> NDArray[np.uint8]:
     Raises SaccadeError if it is missing or damaged.
     """
     for path in (folder / "texture_map.png", folder / "texture_map.jpg", folder / "texture_map.jpeg"):
-        if path.is_file():
+        if os.path.isfile(path):
             try:
-                image = Image.open(path).convert("RGB")
-            except (UnidentifiedImageError, OSError, Image.DecompressionBombError) as error:
-                raise SaccadeError(f"texture {path} is damaged ({error}): fetch it again") from error
+                with opened_image(path, "texture", "fetch it again") as opened_texture:
+                    image = opened_texture.convert("RGB")
+            except SaccadeError as error:
+                if error.__cause__ is None:
+                    raise
+                raise SaccadeError(f"texture {path} is damaged ({error.__cause__}): fetch it again") from error
             image.thumbnail((TEXTURE_MAX_PX, TEXTURE_MAX_PX), Image.Resampling.BOX)
             return np.asarray(image)
     raise SaccadeError(f"texture {folder / 'texture_map.png'} (or .jpg) is missing: fetch the object again")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,9 +12,13 @@ from numpy.typing import NDArray
 from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
 from saccade.shared.errors import SaccadeError
+from saccade.shared.files import MIB, opened
 from saccade.shared.world.geometry import IMAGE_SIZE_PX
 
 Size = tuple[int, int]  # width and height in pixels
+
+MAX_FILE_BYTES = 128 * MIB
+MAX_PIXELS = 64 * MIB  # such as 8192x8192: decoded they take three times as many bytes
 
 _NEED = "give a PNG or JPEG in RGB"
 _FIRST_TURNED = 5  # of the EXIF orientations that exchange width and height
@@ -24,13 +29,13 @@ def read_image(path: Path, *, what: str = "image", need: str = _NEED) -> NDArray
 
     Raises SaccadeError, which begins with `what` and ends with `need`, unless it is a whole PNG or JPEG in RGB.
     """
-    with _opened(path, what, need) as image:
+    with _opened_rgb(path, what, need) as image:
         return np.array(ImageOps.exif_transpose(image) if image.format == "JPEG" else image)
 
 
 def image_size(path: Path, *, what: str = "image", need: str = _NEED) -> Size:
     """Width and height (pixels) of the upright image, from its header alone. Raises SaccadeError as `read_image`."""
-    with _opened(path, what, need) as image:
+    with _opened_rgb(path, what, need) as image:
         if image.format == "JPEG" and image.getexif().get(ExifTags.Base.Orientation, 1) >= _FIRST_TURNED:
             return image.size[::-1]
         return image.size
@@ -46,13 +51,30 @@ def read_goal_image(path: Path) -> NDArray[np.uint8]:
 
 
 @contextmanager
-def _opened(path: Path, what: str, need: str) -> Iterator[Image.Image]:
-    try:
-        with Image.open(path, formats=("PNG", "JPEG")) as image:
-            if image.mode != "RGB":
-                raise SaccadeError(f"{what} {path} has mode {image.mode}, not RGB: {need}")
-            yield image
-    except UnidentifiedImageError as error:
-        raise SaccadeError(f"{what} {path} is neither PNG nor JPEG: {need}") from error
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:  # a damaged PNG: SyntaxError
-        raise SaccadeError(f"{what} {path} cannot be read ({error}): {need}") from error
+def _opened_rgb(path: Path, what: str, need: str) -> Iterator[Image.Image]:
+    """As `opened_image`, of an image in RGB alone."""
+    with opened_image(path, what, need) as image:
+        if image.mode != "RGB":
+            raise SaccadeError(f"{what} {path} has mode {image.mode}, not RGB: {need}")
+        yield image
+
+
+@contextmanager
+def opened_image(path: Path, what: str, need: str) -> Iterator[Image.Image]:
+    """A PNG or JPEG of any mode, of which the header was read. Raises SaccadeError for another and for one that is too
+    large, also where reading its pixels fails within the context."""
+    with opened(path, what, need, MAX_FILE_BYTES) as stream, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of broken EXIF data, which does no harm
+        warnings.simplefilter("error", Image.DecompressionBombWarning)
+        try:
+            with Image.open(stream, formats=("PNG", "JPEG")) as image:
+                width, height = image.size
+                if width * height > MAX_PIXELS:
+                    raise SaccadeError(f"{what} {path} has {width}x{height} pixels, more than {MAX_PIXELS}: {need}")
+                yield image
+        except SaccadeError:
+            raise
+        except UnidentifiedImageError as error:
+            raise SaccadeError(f"{what} {path} is neither PNG nor JPEG: {need}") from error
+        except Exception as error:  # Pillow raises many kinds for what is damaged, a bomb, or has endless texts in it
+            raise SaccadeError(f"{what} {path} cannot be read ({error or type(error).__name__}): {need}") from error
