@@ -1,7 +1,7 @@
-"""Saccade from Python: `run` runs an agent, `open` reads a log, `Agent` is an agent within this process.
+"""The Python interface of Saccade: `run` runs an agent, `open` reads a log, `Agent` is an agent within this process.
 
-The keywords of `run` and `Agent` are keys of the configuration: by their last part where that is unique (`objects`,
-`seed`, `step_m`), or as a section with a dictionary (`planner={"step_m": 0.03}`).
+The keyword arguments of `run` and `Agent` are keys of the configuration. A key is given by its last part where that
+part is unique (`objects`, `seed`, `step_m`), or as its section with a dictionary (`planner={"step_m": 0.03}`).
 """
 
 from __future__ import annotations
@@ -29,12 +29,14 @@ from saccade.shared.config import Config, load
 from saccade.shared.errors import SaccadeError
 
 DEFAULT_AGENT = "sceneccn"
-NICKNAMES = {"bus": "bus.kind", "source": "camera.source"}  # what these keywords mean, of what they could mean
+# Several keys end in these words: this is the one that is meant
+NICKNAMES = {"bus": "bus.kind", "source": "camera.source"}
 
 
 @dataclass(frozen=True)
 class Run:
-    """A run that is over. `path`: its folder, with `run.mcap`, `config.json` and `picture.png`."""
+    """A finished run. `path` is its folder, which holds `run.mcap`, `config.json` and `picture.png`. `results` says how
+    each episode ended; it is empty if nobody judged the run."""
 
     path: Path
     config: Config
@@ -42,23 +44,24 @@ class Run:
 
     @property
     def result(self) -> Result | None:
-        """How the last episode ended; None where nobody judged it, as with a real camera."""
+        """How the last episode ended. It is None if nobody judged the run, as with a real camera."""
         return self.results[-1] if self.results else None
 
     def open(self) -> Log:
-        """The run's log."""
+        """Opens the log of the run."""
         return Log(self.path)
 
 
 def run(*, goal: str | Path | ArrayLike | None = None, agent: str = DEFAULT_AGENT, world: str = DEFAULT_WORLD,
         out: str | Path | None = None, config: str | Path | None = None, show: bool = False, **values: Any) -> Run:
-    """Runs an agent as `saccade run` does, and returns when all its episodes are over.
+    """Runs an agent like the command `saccade run`, and returns when all its episodes are over.
 
-    `goal`: an image to find, a file or an array [480, 480, 3] of bytes, instead of the scene's own. `config`: a file or
-    a preset's name, which the other keywords change. `out`: the new folder of the run, `runs/<time>-<seed>` where
-    absent. `show` prints the progress. Raises SaccadeError for what the user can mend.
+    `goal` is an image to find: a file, or an array [480, 480, 3] of uint8. Without it the goal comes from the
+    simulator's scene, and with a real camera the agent explores. `config` is a configuration file or the name of a
+    preset; the other keywords override its values. `out` is a new folder for the run, by default `runs/<time>-<seed>`.
+    With `show` the progress is printed. Raises SaccadeError if something is wrong that the user can repair.
     """
-    from saccade.app.look.picture import draw_run  # matplotlib is loaded where it is wanted
+    from saccade.app.look.picture import draw_run  # here, so that matplotlib is only loaded when it is needed
 
     with tempfile.TemporaryDirectory() as folder:
         goal_file = None if goal is None else _file_of(goal, Path(folder))
@@ -71,16 +74,18 @@ def run(*, goal: str | Path | ArrayLike | None = None, agent: str = DEFAULT_AGEN
 
 
 def open(path: str | Path) -> Log:
-    """The log of a run, by the run's folder or the log itself, of any format that was ever written. It is read lazily
-    and once, from start to end. Raises SaccadeError for what is no log."""
+    """Opens the log of a run. `path` is the run's folder or the log file itself. Every format that Saccade ever wrote
+    can be read. The log is read lazily and once, from start to end. Raises SaccadeError if the file is not a log."""
     return Log(path)
 
 
 class Agent(_Agent):
-    """An agent within this process, for a robot or a simulator of your own: `action = agent.step(rgb, pose)`.
+    """An agent within this process, for your own robot or simulator: `action = agent.step(rgb, pose)`.
 
-    `goal`: the image to reach, a file or an array [H, W, 3] of bytes; without one the agent explores. `intrinsics`:
-    (fx, fy, cx, cy) of your images, in pixels. Raises SaccadeError for a configuration or a goal that cannot be used.
+    `goal` is the image to reach: a file, or an array [H, W, 3] of uint8. Without a goal the agent explores.
+    `intrinsics` are (fx, fy, cx, cy) of your images, in pixels. Without them, an image of 480x480 pixels is taken as an
+    image of the training's camera, and of any other image the central square is used. Raises SaccadeError if the
+    configuration or the goal cannot be used.
     """
 
     def __init__(self, *, goal: str | Path | ArrayLike | None = None, intrinsics: Sequence[float] | None = None,
@@ -90,7 +95,7 @@ class Agent(_Agent):
 
 
 def keys_of(values: dict[str, Any]) -> dict[str, Any]:
-    """Dotted keys of the configuration and their values, from keywords. Raises SaccadeError for a keyword that names no
+    """Turns keywords into dotted keys of the configuration with their values. Raises SaccadeError if a keyword names no
     key, or more than one."""
     keys: dict[str, Any] = {}
     for name, value in values.items():
@@ -111,7 +116,7 @@ def keys_of(values: dict[str, Any]) -> dict[str, Any]:
 
 @cache
 def _leaves() -> dict[str, tuple[str, ...]]:
-    """The dotted keys that end in each name."""
+    """For each last part of a key: all dotted keys that end in it."""
     leaves: dict[str, tuple[str, ...]] = {}
     for name, field in Config.model_fields.items():
         section = field.annotation
@@ -124,7 +129,8 @@ def _leaves() -> dict[str, tuple[str, ...]]:
 
 
 def _file_of(goal: str | Path | ArrayLike, folder: Path) -> Path:
-    """The goal as a file, which the simulator reads when it begins."""
+    """Returns the goal as a file, because the simulator reads a file when it starts. An array is written into
+    `folder`."""
     if isinstance(goal, (str, Path)):
         return Path(goal)
     path = folder / "goal.png"

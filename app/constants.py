@@ -1,5 +1,5 @@
-"""The agent's own constants: the numbers of belief and planner that say in a comment where they are from, and those of
-their configuration."""
+"""The agent's own constants. They are the numbers of belief and planner whose comment says where they come from, and
+the numbers in the configuration of belief and planner."""
 
 from __future__ import annotations
 
@@ -13,15 +13,17 @@ from saccade.shared.config import PACKAGE, BeliefConfig, PlannerConfig, Section
 MODULES = ("services.belief.core", "services.belief.pose", "services.belief.position", "services.planner.core",
            "services.planner.free_energy")
 SECTIONS: dict[str, type[Section]] = {"belief": BeliefConfig, "planner": PlannerConfig}
-KINDS = ("chosen", "derived", "measured", "from the")  # what a constant's comment begins with
-SHOWN = ("planner.step_m", "belief.published_particles")  # the paper's, and one that only the viewer sees
+KINDS = ("chosen", "derived", "measured", "from the")  # a constant's comment begins with one of these
+# Not listed: a number of the paper, and one for the viewer only
+SHOWN = ("planner.step_m", "belief.published_particles")
 PROBABILITIES = {"BORN_VAGUE", "SURE", "DETECTED", "USED_VIEW", "belief.present_above", "planner.goal_confidence",
                  "belief.resample_below", "belief.view_worth", "belief.missed_weight"}
 
 
 @dataclass(frozen=True)
 class Constant:
-    """A number of the agent's own making. `where`: a module of this package, or the section of the configuration."""
+    """One constant. `where` is a module of this package, or a section of the configuration. `comment` says where the
+    number comes from or what it means."""
 
     where: str
     name: str
@@ -30,11 +32,12 @@ class Constant:
 
     @property
     def label(self) -> str:
-        """Its name in the results."""
+        """The name of the constant in the results."""
         return f"{self.where}.{self.name}"
 
     def changed(self, factor: float) -> float:
-        """Half or twice the value, whole where it is a whole number, a probability where it is one."""
+        """Returns the value times `factor`. An integer stays an integer of at least 1. A probability stays at most
+        0.99."""
         value = self.value * factor
         if self.name in PROBABILITIES or self.label in PROBABILITIES:
             value = min(value, 0.99)
@@ -42,8 +45,7 @@ class Constant:
 
 
 def constants() -> Iterator[Constant]:
-    """All of them, in the order of the source: those whose comment says where the number is from, and the numbers of
-    the configuration."""
+    """Yields all constants in the order of the source: first those of the modules, then those of the configuration."""
     for module in MODULES:
         source = (PACKAGE / Path(*module.split("."))).with_suffix(".py").read_text()
         lines = source.splitlines()

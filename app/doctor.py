@@ -1,4 +1,4 @@
-"""`saccade doctor`: what works on this machine, what is missing, and how to mend it."""
+"""`saccade doctor` checks what works on this machine and what is missing, and says how to repair it."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ assert len(np.unique(image.reshape(-1, 3), axis=0)) > 10, "the image is empty"
 
 @dataclass(frozen=True)
 class Finding:
-    """One row: what was found, and how to mend it where it is missing."""
+    """The result of one check: what was found, and how to repair it if it is missing."""
 
     ok: bool
     detail: str
@@ -53,7 +53,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Check:
-    """`needed`: the default run does not work without it."""
+    """One check. If it is `needed`, the default run does not work without it."""
 
     name: str
     look: Callable[[], Finding]
@@ -61,7 +61,7 @@ class Check:
 
 
 def checks() -> tuple[Check, ...]:
-    """All of them, the default run's needs first."""
+    """All checks, in the order of the table."""
     return (Check("Python", python), Check("OpenGL", opengl), Check("Zenoh", zenoh),
             Check("shared memory", shared_memory, needed=False), Check("objects pantry", lambda: objects("pantry")),
             Check("weights pantry", lambda: weights("pantry")), Check("objects ycb", ycb, needed=False),
@@ -69,7 +69,7 @@ def checks() -> tuple[Check, ...]:
 
 
 def examine(console: Console | None = None, which: tuple[Check, ...] | None = None) -> int:
-    """Prints the table; 1 if the default run lacks something, else 0."""
+    """Runs the checks and prints the table. Returns 1 if the default run lacks something, else 0."""
     console, lacking = console or Console(), []
     table = Table(title="saccade doctor")
     for header in ("what", "state", "found"):
@@ -86,9 +86,10 @@ def examine(console: Console | None = None, which: tuple[Check, ...] | None = No
 
 
 def _look(check: Check) -> Finding:
+    """Runs one check. An error becomes a finding that says what is missing."""
     try:
         return check.look()
-    except SaccadeError as error:  # its text says what to do
+    except SaccadeError as error:  # the text of the error says what to do
         return Finding(False, str(error))
     except (ImportError, OSError) as error:
         return Finding(False, f"{type(error).__name__}: {error}", "install Saccade again: pip install -e .")
@@ -99,7 +100,7 @@ def _escape(text: str) -> str:
 
 
 def python() -> Finding:
-    """The interpreter."""
+    """Checks the version of Python."""
     version = ".".join(str(n) for n in sys.version_info[:3])
     wanted = ".".join(str(n) for n in OLDEST_PYTHON)
     return Finding(sys.version_info >= OLDEST_PYTHON, version, "" if sys.version_info >= OLDEST_PYTHON else
@@ -107,7 +108,7 @@ def python() -> Finding:
 
 
 def opengl() -> Finding:
-    """Renders one image, in a process of its own: a bad driver may end it."""
+    """Renders one image in a process of its own, because a bad driver may crash the process."""
     backend = choose_backend()
     try:
         done = subprocess.run([sys.executable, "-c", RENDER], timeout=RENDER_S, capture_output=True,
@@ -117,12 +118,12 @@ def opengl() -> Finding:
     if done.returncode:
         lines = done.stderr.strip().splitlines() or [f"the process ended with code {done.returncode}"]
         return Finding(False, f"{backend}: {lines[-1]}",
-                       "install libosmesa6 (`sudo apt-get install libosmesa6`) or set MUJOCO_GL to another one")
+                       "install libosmesa6 (`sudo apt-get install libosmesa6`) or set MUJOCO_GL to another backend")
     return Finding(True, f"{backend} renders")
 
 
 def zenoh() -> Finding:
-    """Opens a router on a free port of this machine and passes a message through it."""
+    """Opens a router on a free port of this machine, and sends a message through it."""
     endpoint = free_endpoint("tcp/127.0.0.1:0")
     sent = encode(Status(run="doctor", episode=0, step=0, service="doctor", state="ready"))
     arrived = threading.Event()
@@ -151,10 +152,10 @@ def zenoh() -> Finding:
 
 
 def shared_memory() -> Finding:
-    """Room for pixels that are not copied."""
+    """Checks that /dev/shm has room for images. Images in shared memory need not be copied."""
     folder = Path("/dev/shm")
     if not folder.is_dir():
-        return Finding(False, "there is no /dev/shm", "none needed: pixels are copied instead")
+        return Finding(False, "there is no /dev/shm", "nothing to do: images are copied instead")
     usage = shutil.disk_usage(folder)
     detail = f"{usage.free / 2 ** 20:.0f} of {usage.total / 2 ** 20:.0f} MiB free in /dev/shm"
     return Finding(usage.free >= ROOM_BYTES, detail, "" if usage.free >= ROOM_BYTES else
@@ -162,12 +163,12 @@ def shared_memory() -> Finding:
 
 
 def objects(object_set: str) -> Finding:
-    """The objects of a set."""
+    """Lists the objects of a set. Raises SaccadeError if the set is unknown."""
     return Finding(True, ", ".join(names_of(object_set)))
 
 
 def ycb() -> Finding:
-    """The scans, which are not part of the project."""
+    """Checks that the YCB scans are there. They are not part of the project."""
     folder = ycb_folder()
     absent = [name for name in names_of("ycb") if not (folder / name / "textured.obj").is_file()]
     if absent:
@@ -177,7 +178,7 @@ def ycb() -> Finding:
 
 
 def weights(object_set: str) -> Finding:
-    """The manifest of a set's weights, and every file against its hash."""
+    """Reads the manifest of a set's weights, and compares every file with its hash."""
     from saccade.shared.model.weights import Weights
 
     folder = Config(scene=SceneConfig(objects=object_set)).weights
@@ -192,7 +193,7 @@ def weights(object_set: str) -> Finding:
 
 
 def torch_device() -> Finding:
-    """Where training runs; the agent itself runs on the processor."""
+    """Names the device on which training runs. The agent itself runs on the processor."""
     import torch
 
     if torch.cuda.is_available():

@@ -1,4 +1,4 @@
-"""Where results come from: the machine, and paths that mean something elsewhere too."""
+"""Says where results come from: the machine, and paths that also mean something on another machine."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PACKAGES = ("numpy", "torch", "mujoco")
 
 
 def machine() -> dict[str, str | int]:
-    """What may change the last bits of a result, and its seconds."""
+    """Describes what may change the last bits of a result, or its running time."""
     return {"processor": _processor(), "cores": os.cpu_count() or 1, "system": platform.system(),
             "python": platform.python_version(), "opengl": choose_backend(),
             **{name: metadata.version(name) for name in PACKAGES}}
@@ -29,6 +29,6 @@ def _processor() -> str:
 
 
 def shown(path: Path) -> str:
-    """A path relative to the repository where it is inside, else its name alone."""
+    """Returns a path relative to the repository if the path is inside it, else the name alone."""
     resolved = path.resolve()
     return str(resolved.relative_to(PACKAGE)) if resolved.is_relative_to(PACKAGE) else resolved.name

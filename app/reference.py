@@ -1,7 +1,8 @@
-"""`python -m saccade.app.reference docs`: the reference pages of the guide, derived from what they describe.
+"""`python -m saccade.app.reference docs` writes the reference pages of the guide, from the code that they describe.
 
-The wire from the registry of topics and the messages, the configuration from its sections, the command line from its
-commands, the agent's own constants from their comments and from what `benchmarks/constants.py` measured.
+The page about the bus comes from the list of topics and from the messages. The page about the configuration comes from
+its sections, and the page about the command line from the commands. The page about the agent's own constants comes from
+their comments and from the results of `benchmarks/constants.py`.
 """
 
 from __future__ import annotations
@@ -29,12 +30,12 @@ MEASURED = PACKAGE / "results" / "benchmarks" / "constants.json"
 
 
 def pages() -> dict[str, str]:
-    """The text of every page, by its file in the guide's folder."""
+    """Returns the text of every page, by its file name in the guide's folder."""
     return {"wire.md": wire(), "reference/configuration.md": configuration(), "reference/cli.md": command_line(),
             "reference/constants.md": constants()}
 
 
-# --- the wire
+# --- the bus
 
 WIRE_TEXT = """
 Every message is a publication on a Zenoh key `saccade/<world>/<topic>`, with `/<object>` or `/<service>` where a topic
@@ -47,8 +48,8 @@ client and MessagePack alone.
 
 
 def wire() -> str:
-    """Every key and every field."""
-    lines = ["# The wire", "", _flat(WIRE_TEXT), "", "## Topics", "",
+    """Returns the page about the bus: every key and every field."""
+    lines = ["# Topics and messages", "", _flat(WIRE_TEXT), "", "## Topics", "",
              "A latched topic has one message an episode, which holds for every later step.", ""]
     lines += _table(("topic", "key", "message", "latched", "published by", "heard by"), (
         (f"`{topic.name}`", f"`{topic.key('<world>', '<part>')}`", _link(topic.type), "yes" if topic.latched else "",
@@ -66,7 +67,8 @@ def _link(message: type[Message]) -> str:
 
 
 def _who(topic: Topic, side: str) -> Iterator[str]:
-    """The services that declare it; every service publishes its status, and the recorder hears everything."""
+    """Yields the services that declare the topic. Every service publishes its status. The recorder reads every topic
+    and is not named."""
     if topic.name == "status":
         yield {"outputs": "every service", "inputs": "launcher, viewer"}[side]
         return
@@ -97,16 +99,16 @@ def _kind(kind: Any) -> str:
 # --- the configuration
 
 CONFIGURATION_TEXT = """
-A configuration file is TOML or JSON (`--config FILE`). Options of the command line go before the file, and
-`--set KEY=VALUE` goes before all, for example `--set planner.step_m=0.03`. An unknown key is an error. Every run saves
+A configuration file is TOML or JSON (`--config FILE`). Options of the command line override the file, and
+`--set KEY=VALUE` overrides both, for example `--set planner.step_m=0.03`. An unknown key is an error. Every run saves
 its whole configuration as `config.json`.
 """
 
 
 def configuration() -> str:
-    """Every key, section by section."""
+    """Returns the page about the configuration: every key, section by section."""
     lines = ["# Configuration", "", _flat(CONFIGURATION_TEXT), "",
-             "## Keys of no section", "", *_keys(Config, "")]
+             "## Keys without a section", "", *_keys(Config, "")]
     for name, field in Config.model_fields.items():
         section = field.annotation
         if inspect.isclass(section) and issubclass(section, BaseModel):
@@ -124,7 +126,7 @@ def _keys(section: type[BaseModel], prefix: str) -> list[str]:
 # --- the command line
 
 def command_line() -> str:
-    """Every command with its arguments and options."""
+    """Returns the page about the command line: every command with its arguments and options."""
     from saccade.app.cli.main import app
 
     lines = ["# Command line", "", "`saccade COMMAND --help` shows the same."]
@@ -137,7 +139,7 @@ def command_line() -> str:
 
 
 def _commands(command: Any, words: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """The commands that do something, by their words."""
+    """Yields every command that has no subcommands, with the words that call it."""
     if not hasattr(command, "commands"):
         yield words, command
         return
@@ -173,7 +175,8 @@ is fewer). Probabilities are doubled to 0.99 at most. `python -m saccade.benchma
 
 
 def constants() -> str:
-    """Each with where it is from, and what happens to the development scenes at half and at twice its value."""
+    """Returns the page about the agent's own constants: where each comes from, and what happens on the development
+    scenes at half and at twice its value."""
     state = json.loads(MEASURED.read_text()) if MEASURED.is_file() else {}
     lines = ["# The agent's own constants", "", _flat(CONSTANTS_TEXT), ""]
     if default := state.get("default"):
@@ -199,7 +202,7 @@ def _effect(told: dict[str, Any] | None) -> str:
 # --- Markdown and source
 
 def attribute_docstrings(owner: type) -> dict[str, str]:
-    """The texts under the attributes of a class, its own and those of its bases."""
+    """Returns the text below each attribute of a class, including the attributes of its base classes."""
     told: dict[str, str] = {}
     for base in reversed(owner.__mro__[:-1]):
         body = ast.parse(textwrap.dedent(inspect.getsource(base))).body[0]
@@ -220,7 +223,7 @@ def _flat(text: str | None) -> str:
 
 
 def main(folder: Path) -> None:
-    """Writes the pages."""
+    """Writes all pages into `folder`."""
     (folder / "reference").mkdir(parents=True, exist_ok=True)
     for name, text in pages().items():
         (folder / name).write_text(text)

@@ -50,7 +50,7 @@ def test_an_episode_is_chosen_and_what_is_not_known_is_left_out(monkeypatch, cap
 
 
 @pytest.mark.parametrize(("arguments", "complaint"), [
-    ((GOLDEN, "run.avi"), "run.avi is no film's name: let it end with .mp4 or .gif"),
+    ((GOLDEN, "run.avi"), "run.avi cannot be a film: its name must end with .mp4 or .gif"),
     ((GOLDEN, "run.gif", "--episode", "3"), "has nothing of episode 3 in it"),
     (("nowhere.mcap", "run.gif"), "nowhere.mcap cannot be read"),
     ((GOLDEN, GOLDEN.parent / "nowhere" / ".." / "make.py" / "run.gif"), "cannot be written")])

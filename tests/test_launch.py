@@ -101,7 +101,7 @@ def test_a_run_goes_on_without_one_who_only_looks_on(tmp_path, module, reason):
         config = configuration(2, 100).with_values({"viewer.port": taken.getsockname()[1]})
         results = launch(config, tmp_path / "run", None, (*FAKES, looking), said.append)
     assert [result.episode for result in results] == [0, 1]
-    assert any(text.startswith("on without the viewer: ") and reason in text for text in said), said
+    assert any(text.startswith("the run goes on without the viewer: ") and reason in text for text in said), said
     assert missing(tmp_path / "run" / "run.mcap").complete
 
 

@@ -1,6 +1,6 @@
-"""`saccade bench`: an agent on every scene of a file, in processes that share nothing, and what it comes to.
+"""`saccade bench` runs an agent on every scene of a file, in processes that share nothing, and reports the results.
 
-Scene number k of the file is episode k whichever process runs it, so the split over processes changes no result.
+Scene number k of the file is episode k, whichever process runs it. So the number of processes changes no result.
 """
 
 from __future__ import annotations
@@ -33,18 +33,19 @@ from saccade.shared.errors import SaccadeError
 from saccade.shared.log.provenance import commit
 from saccade.shared.loop.local import run_local
 
-SCENES_ENDING = ".scenes.json"  # of the file with the scenes that were drawn
-RUN = "bench"  # the same in every benchmark: it is in the messages
-MATTERS = ("agent", "objects", "config", "weights", "scenes")  # facts without which results do not belong together
+SCENES_ENDING = ".scenes.json"  # drawn scenes are kept in a file with this ending
+RUN = "bench"  # the run's name is part of every message, so it is always the same
+MATTERS = ("agent", "objects", "config", "weights", "scenes")  # results belong together only if these facts are equal
 RECORD_KEYS = ("scene", "target", "objects", "success", "steps", "azimuth_error_rad", "elevation_error_rad",
                "range_error_m", "declared", "declared_true")
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What is to be run: `config` as resolved by `prepare`, the file's scenes and the numbers of those in question.
+    """What is to be run: `config` as `prepare` has resolved it, all scenes of the file, and the numbers of the chosen
+    ones.
 
-    `suite` is the name under which the scenes are known, if any.
+    `suite` is the name of the scenes, if they have one.
     """
 
     agent: str
@@ -56,20 +57,21 @@ class Plan:
 
     @property
     def file(self) -> Path:
-        """That of the scenes."""
-        assert self.config.scene.file is not None  # since the configuration is resolved
+        """The file of the scenes."""
+        assert self.config.scene.file is not None  # because the configuration is resolved
         return self.config.scene.file
 
     @property
     def partial(self) -> Path:
-        """Where results are kept as they come."""
+        """The file that keeps the results while the benchmark runs."""
         return self.out.with_name(self.out.name + ".partial.jsonl")
 
 
 def prepare(agent: str, config: Config, out: Path, *, suite: str | None = None, limit: int | None = None) -> Plan:
     """Resolves and checks everything before the first scene runs.
 
-    Without a file: the suite's scenes, kept beside `out` where they are drawn. Raises SaccadeError for both.
+    If the configuration names no file, the scenes are those of the suite. Scenes that are drawn are kept beside `out`.
+    Raises SaccadeError if both a file and a suite are given, or if scenes or weights cannot be used.
     """
     if config.scene.file is not None and suite is not None:
         raise SaccadeError("scenes come from a file or from a suite: leave --scenes or --suite out")
@@ -86,7 +88,8 @@ def prepare(agent: str, config: Config, out: Path, *, suite: str | None = None, 
 
 
 def spread(scenes: Sequence[Scene], limit: int | None) -> tuple[int, ...]:
-    """Numbers of at most `limit` scenes, as even over targets and over object counts as can be; always the same."""
+    """Returns the numbers of at most `limit` scenes, spread as evenly as possible over targets and object counts. The
+    choice is always the same."""
     if limit is None or limit >= len(scenes):
         return tuple(range(len(scenes)))
     targets = list(dict.fromkeys(scene.target for scene in scenes))
@@ -94,7 +97,7 @@ def spread(scenes: Sequence[Scene], limit: int | None) -> tuple[int, ...]:
     cells: dict[tuple[int, int], list[int]] = {}
     for number, scene in enumerate(scenes):
         cells.setdefault((targets.index(scene.target), counts.index(len(scene.on_table))), []).append(number)
-    # along the diagonals of targets x counts, so that any few in a row differ in both
+    # Goes along the diagonals of targets x counts, so that successive scenes differ in both.
     side = max(len(targets), len(counts))
     order = sorted(cells, key=lambda cell: ((cell[1] - cell[0]) % side, cell[0]))
     rounds = max(len(members) for members in cells.values())
@@ -103,7 +106,8 @@ def spread(scenes: Sequence[Scene], limit: int | None) -> tuple[int, ...]:
 
 
 def facts(plan: Plan, command: str) -> dict[str, Any]:
-    """Where the results come from: goes into the file, and decides whether a run may be taken up again."""
+    """Describes where the results come from. These facts go into the file, and decide whether an interrupted run may be
+    continued."""
     config = plan.config.model_dump(mode="json")
     config["scene"]["file"] = shown(plan.file)
     if plan.config.perception.weights is not None:
@@ -115,10 +119,11 @@ def facts(plan: Plan, command: str) -> dict[str, Any]:
 
 
 def bench(plan: Plan, *, jobs: int, command: str, console: Console, cluster: str | None = None) -> list[dict[str, Any]]:
-    """Runs what is not there yet, writes `plan.out`, prints the table; returns the records in the file's order.
+    """Runs the scenes that have no result yet, writes `plan.out` and prints the table. Returns the records in the
+    file's order.
 
-    Raises SaccadeError for a scene that cannot be run and for results of another run in the way; what has been reached
-    is kept either way.
+    Raises SaccadeError if a scene cannot be run, or if results of another run are in the way. The results so far are
+    kept in both cases.
     """
     origin = facts(plan, command)
     known = _take_up(plan, origin)
@@ -146,13 +151,15 @@ def bench(plan: Plan, *, jobs: int, command: str, console: Console, cluster: str
 
 
 def _take_up(plan: Plan, origin: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """The records kept by an interrupted run, by scene; appends this run's header."""
-    lines = plan.partial.read_text().split("\n")[:-1] if plan.partial.is_file() else []  # a cut last line is dropped
+    """Returns the records that an interrupted run has kept, by scene, and appends this run's header. Raises
+    SaccadeError if they belong to another run."""
+    # A last line that was cut is dropped
+    lines = plan.partial.read_text().split("\n")[:-1] if plan.partial.is_file() else []
     records = {}
     for line in lines:
         try:
             entry = json.loads(line)
-        except ValueError:  # cut by a crash in an earlier round
+        except ValueError:  # a line that an earlier crash has cut
             continue
         if "facts" not in entry:
             records[entry["scene"]] = entry
@@ -167,7 +174,7 @@ def _take_up(plan: Plan, origin: dict[str, Any]) -> dict[str, dict[str, Any]]:
 
 
 def _finish(plan: Plan, origin: dict[str, Any], records: list[dict[str, Any]]) -> None:
-    """Writes the one JSON object; results of an older state of the code say so."""
+    """Writes the results as one JSON object. It names every commit whose code has contributed results."""
     lines = [line for line in plan.partial.read_text().splitlines() if line.startswith('{"facts"')]
     commits = ", ".join(dict.fromkeys(json.loads(line)["facts"]["commit"] for line in lines))
     text = json.dumps(origin | {"commit": commits, "results": records}, indent=1)
@@ -192,7 +199,7 @@ def _progress(console: Console, total: int) -> Iterator:
 
 
 def _records(plan: Plan, numbers: Sequence[int], jobs: int, cluster: str | None = None) -> Iterator[dict[str, Any]]:
-    """The records of these scenes as they are ready."""
+    """Yields the records of these scenes as they are ready."""
     text = plan.config.model_dump_json()
     work = {plan.scenes[number].id: (plan.agent, text, number) for number in numbers}
     try:
@@ -204,13 +211,14 @@ def _records(plan: Plan, numbers: Sequence[int], jobs: int, cluster: str | None 
 
 @functools.lru_cache(maxsize=1)
 def cores(agent: str, config_text: str) -> tuple[Config, list[Pair]]:
-    """Meshes, OpenGL and weights are loaded once per process."""
+    """Builds declarations and cores. Meshes, OpenGL and weights are thus loaded once per process."""
     config = Config.model_validate_json(config_text)
     return config, local_pairs(agent, config)
 
 
 def run_scene(agent: str, config_text: str, number: int) -> dict[str, Any]:
-    """The record of one scene, run within this process as episode `number`."""
+    """Runs one scene within this process as episode `number`, and returns its record with the seconds of the scene and
+    the mean milliseconds per step of each service."""
     config, pairs = cores(agent, config_text)
     results: list[Result] = []
     spent_ms: dict[str, list[float]] = {service.name: [] for service, _ in pairs}
@@ -228,5 +236,5 @@ def run_scene(agent: str, config_text: str, number: int) -> dict[str, Any]:
 
 
 def record_of(result: Result) -> dict[str, Any]:
-    """What the results file says about an episode, but for its times."""
+    """Returns what the results file says about an episode, without its times."""
     return {key: getattr(result, key) for key in RECORD_KEYS}

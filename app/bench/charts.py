@@ -1,4 +1,4 @@
-"""The pictures of a report: plots of the results files, and of episodes that are run again for them."""
+"""The pictures of a report: plots of the results files, and pictures of episodes that are run again."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from saccade.shared.bus.messages import Belief, Message
 from saccade.shared.bus.topics import Topic
 from saccade.shared.world.task import MAX_STEPS, SUCCESS_ROTATION_RAD, SUCCESS_TRANSLATION_M
 
-VIEWS = (1, 5, 10, 20, 40)  # after so many the belief is drawn
-CASES = 3  # worst, and as many from the middle
+VIEWS = (1, 5, 10, 20, 40)  # the belief is drawn after so many views
+CASES = 3  # number of worst cases, and of cases from the middle
 
 
 def draw_errors(files: Sequence[Results], out: Path) -> None:
-    """Box plots of the three errors; whiskers to 1.5 interquartile ranges."""
+    """Draws box plots of the three errors. The whiskers reach to 1.5 interquartile ranges."""
     figure = new_figure((12.0, 1.6 + 0.5 * len(files)))
     for k, (axes, (key, title)) in enumerate(zip(figure.subplots(1, 3), MEASURES.items(), strict=True)):
         values = [[r[key] for r in file.records] for file in files]
@@ -38,7 +38,7 @@ def draw_errors(files: Sequence[Results], out: Path) -> None:
 
 
 def draw_objects(files: Sequence[Results], out: Path) -> None:
-    """Share of successes against the number of objects on the table, with Wilson's 95 % intervals."""
+    """Plots the share of successes against the number of objects on the table, with Wilson's 95 % intervals."""
     figure = new_figure((7.0, 4.5))
     axes = figure.subplots()
     for k, (file, colour) in enumerate(zip(files, _colours(files), strict=True)):
@@ -51,14 +51,15 @@ def draw_objects(files: Sequence[Results], out: Path) -> None:
                       color=colour, label=file.label)
     axes.set(xlabel="objects on the table", ylabel="success (%)", ylim=(0, 104))
     locator = axes.xaxis.get_major_locator()
-    assert isinstance(locator, MaxNLocator)  # as of every linear axis
+    assert isinstance(locator, MaxNLocator)  # every linear axis has one
     locator.set_params(integer=True)
     _legend(figure)
     save(figure, out)
 
 
 def draw_steps(files: Sequence[Results], out: Path) -> None:
-    """Share of all scenes in which the goal was reached within so many steps."""
+    """Plots, against the number of steps, the share of all scenes in which the goal was reached within so many
+    steps."""
     figure = new_figure((7.0, 4.5))
     axes = figure.subplots()
     for file, colour in zip(files, _colours(files), strict=True):
@@ -72,20 +73,21 @@ def draw_steps(files: Sequence[Results], out: Path) -> None:
 
 
 def pick(records: Sequence[Record], count: int = CASES) -> tuple[list[Record], list[Record]]:
-    """The worst cases, worst first, and those in the middle: failed before reached, then by their errors."""
+    """Returns the worst cases, worst first, and the cases in the middle. A failed case is worse than a successful one;
+    among equals the larger errors are worse."""
     order = sorted(records, key=lambda r: (r["success"], -severity(r)))
     worst, start = order[:count], (len(order) - count) // 2
     return worst, [r for r in order[max(start, 0):][:count] if r not in worst]
 
 
 def severity(record: Record) -> float:
-    """The three errors in one number: each counted in units of success's tolerance."""
+    """Combines the three errors into one number. Each error is counted in units of the success tolerance."""
     angles = (record["azimuth_error_rad"] + record["elevation_error_rad"]) / SUCCESS_ROTATION_RAD
     return angles + record["range_error_m"] / SUCCESS_TRANSLATION_M
 
 
 def draw_gallery(cases: Sequence[tuple[str, Story]], out: Path) -> None:
-    """A column for each (title, episode): the goal above the view that was reached."""
+    """Draws a column for each (title, episode): the goal above the view that was reached."""
     figure = new_figure((2.9 * len(cases), 6.6))
     for axes, (title, story) in zip(figure.subplots(2, len(cases), squeeze=False).T, cases, strict=True):
         image(axes[0], story.goal_rgb, f"{title}\ngoal")
@@ -99,14 +101,14 @@ def draw_gallery(cases: Sequence[tuple[str, Story]], out: Path) -> None:
 
 @dataclass
 class Exploration:
-    """An episode without a goal: what was believed after so many views, per object."""
+    """An episode without a goal. `beliefs` holds what was believed about each object, by the number of views."""
 
     story: Story
     beliefs: dict[int, dict[str, Belief]] = field(default_factory=dict)
 
 
 def explore(again: Again, views: Sequence[int] = VIEWS) -> Exploration | None:
-    """Explores the first of the scenes with the most objects; None if the agent keeps no belief."""
+    """Explores the first of the scenes with the most objects. Returns None if the agent keeps no belief."""
     config = again.config.with_values({"scene.explore": True, "simulator.max_steps": max(views)})
     number = max(range(len(again.scenes)), key=lambda k: (len(again.scenes[k].on_table), -k))
     kept: dict[int, dict[str, Belief]] = {}
@@ -120,10 +122,11 @@ def explore(again: Again, views: Sequence[int] = VIEWS) -> Exploration | None:
 
 
 def draw_exploration(found: Exploration, out: Path) -> None:
-    """The table from above after so many views: particles in colour, true positions black, the camera's path."""
+    """Draws the table from above after each number of views: particles in colour, true positions in black, and the
+    camera's path."""
     figure = new_figure((3.3 * len(found.beliefs), 4.2))
     path, truth = np.array(found.story.path_m), found.story.truth
-    assert truth is not None  # as of every episode that was run to its end
+    assert truth is not None  # every episode that ran to its end has one
     for axes, (views, beliefs) in zip(np.atleast_1d(figure.subplots(1, len(found.beliefs))), found.beliefs.items(),
                                       strict=True):
         table_from_above(axes, f"after {views} view{'s' if views > 1 else ''}")
@@ -140,7 +143,7 @@ def _colours(files: Sequence[Results]) -> list[str]:
 
 
 def _legend(figure: Figure, columns: int = 2) -> None:
-    """Below the axes, each entry once."""
+    """Puts the legend below the axes, each entry once."""
     entries: Mapping = {label: handle for axes in figure.axes
                         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
     figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=columns, fontsize=8,

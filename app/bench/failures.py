@@ -1,4 +1,5 @@
-"""Why scenes failed: each is run again with the truth at hand, and sorted by the first thing that went wrong."""
+"""Explains why scenes failed. Each of them is run again, compared with the truth, and sorted by the first thing that
+went wrong."""
 
 from __future__ import annotations
 
@@ -19,9 +20,9 @@ from saccade.shared.bus.topics import Topic
 from saccade.shared.world.geometry import direction, rotation_angle, unit, viewing_grid
 from saccade.shared.world.task import SUCCESS_ROTATION_RAD, SUCCESS_TRANSLATION_M
 
-FOUND_M = 0.08  # a target believed further off was not found
-DIRECTION_RAD = 0.5  # a goal's direction believed further off is wrong
-SMALL_DPI, COLOURS = 60, 255  # there may be many: a picture takes some 20 kB
+FOUND_M = 0.08  # if the error of the target's position is larger, the target was not found
+DIRECTION_RAD = 0.5  # if the error of the goal's direction is larger, the direction is wrong
+SMALL_DPI, COLOURS = 60, 255  # there may be many pictures; one takes about 20 kB
 
 CLASSES = {
     "target": ("Wrong target", "The goal image was taken for another object, or for none."),
@@ -42,7 +43,8 @@ CLASSES = {
 
 @dataclass(frozen=True)
 class Distance:
-    """From a camera to the goal's view: metres, radians between the attitudes, radians seen from the target."""
+    """The distance from a camera to the goal's view: between the positions (metres), between the attitudes (radians),
+    and between the directions as seen from the target (radians)."""
 
     position_m: float
     attitude_rad: float
@@ -50,24 +52,26 @@ class Distance:
 
     @property
     def tolerances(self) -> float:
-        """How far from success, which is below 1."""
+        """The larger of the errors of position and attitude, in units of the success tolerance. A view below 1 is a
+        success."""
         return max(self.position_m / SUCCESS_TRANSLATION_M, self.attitude_rad / SUCCESS_ROTATION_RAD)
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What a failed episode shows against the truth; None where the agent has no such belief to tell of."""
+    """What a failed episode shows when it is compared with the truth. A value is None if the agent has no such
+    belief."""
 
     scene: str
     target: str
     success: bool
     declared: bool
     steps: int
-    inferred: str | None  # the object that the goal image was taken to show; empty for none
+    inferred: str | None  # the object that the agent took as the goal image's; empty for none
     position_error_m: float | None
     direction_error_rad: float | None
-    nearest: Distance  # to the goal's view, of all steps
-    least_direction_rad: float  # of all steps
+    nearest: Distance  # the step that was nearest to the goal's view
+    least_direction_rad: float  # the smallest of all steps
 
 
     @property
@@ -85,15 +89,16 @@ class Diagnosis:
 
 
 def diagnose(story: Story, ways: Sequence[Distance]) -> Diagnosis:
-    """Compares what was believed at an episode's end with the truth; `ways` are the distances at each step."""
+    """Compares what was believed at the end of an episode with the truth. `ways` holds the distance to the goal's view
+    at each step."""
     truth, result = story.truth, story.result
-    assert truth is not None  # as of every episode that was run to its end
+    assert truth is not None  # every episode that ran to its end has one
     assert result is not None
     belief = story.beliefs.get(truth.target)
     position_error = direction_error = None
     if belief is not None:
         position_error = float(np.linalg.norm(belief.mean_m - truth.target_center_m))
-        direction_error = np.pi  # nothing is known about it
+        direction_error = np.pi  # the agent knows nothing about the direction
         if belief.goal_log_posterior is not None:
             elevation, azimuth = viewing_grid()
             row, column = np.unravel_index(np.argmax(belief.goal_log_posterior), belief.goal_log_posterior.shape)
@@ -105,7 +110,7 @@ def diagnose(story: Story, ways: Sequence[Distance]) -> Diagnosis:
 
 
 def investigate(agent: str, config_text: str, number: int, picture: str) -> Diagnosis:
-    """Runs a scene again, writes its picture, says what it shows."""
+    """Runs a scene again, writes its picture, and returns what it shows."""
     ways: list[Distance] = []
 
     def measure(_topic: Topic, _part: str | None, message: Message) -> None:
@@ -121,7 +126,7 @@ def investigate(agent: str, config_text: str, number: int, picture: str) -> Diag
 
 
 def distance(truth: Truth) -> Distance:
-    """How far the camera is from the goal's view."""
+    """Returns how far the camera is from the goal's view."""
     camera, goal, center = truth.world_from_camera, truth.goal_world_from_camera, truth.target_center_m
     return Distance(float(np.linalg.norm(camera[:3, 3] - goal[:3, 3])),
                     float(rotation_angle(camera[:3, :3], goal[:3, :3])),
@@ -133,7 +138,8 @@ def _angle(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
 
 
 def failed_scenes(again: Again, out: Path, *, jobs: int, console: Console) -> list[tuple[Diagnosis, Path]]:
-    """Every failed scene of a results file with its picture below `out`, in the file's order."""
+    """Returns a diagnosis and a picture for every failed scene of a results file, in the file's order. The pictures are
+    written below `out`."""
     failed = [record["scene"] for record in again.results.records if not record["success"]]
     folder = out / "failures" / again.results.path.stem
     if failed:
@@ -148,7 +154,8 @@ def failed_scenes(again: Again, out: Path, *, jobs: int, console: Console) -> li
 
 
 def section(title: str, scenes: int, cases: Sequence[tuple[Diagnosis, str]]) -> list[str]:
-    """The Markdown of one results file of `scenes` scenes; a case is a diagnosis and the address of its picture."""
+    """Returns the Markdown for one results file of `scenes` scenes. A case is a diagnosis and the address of its
+    picture."""
     lines = [f"## {title}", "", f"{len(cases)} of {scenes} scenes failed."]
     if not cases:
         return [*lines, ""]
@@ -167,7 +174,7 @@ def section(title: str, scenes: int, cases: Sequence[tuple[Diagnosis, str]]) -> 
 
 
 def describe(d: Diagnosis) -> str:
-    """The figures of a diagnosis in one line."""
+    """Returns the figures of a diagnosis as one line."""
     parts = [] if d.inferred is None else [f"target inferred: {d.inferred or 'none'}"]
     if d.position_error_m is not None:
         parts.append(f"believed {100 * d.position_error_m:.1f} cm off")

@@ -1,4 +1,5 @@
-"""Scenes of a results file once more: the same configuration, scenes and seeds give the same episodes, to look at."""
+"""Runs scenes of a results file again, so that they can be looked at. The same configuration, scenes and seeds give the
+same episodes."""
 
 from __future__ import annotations
 
@@ -20,7 +21,7 @@ from saccade.shared.config import PACKAGE, Config, validate
 from saccade.shared.errors import SaccadeError
 from saccade.shared.loop.local import run_local
 
-TOLD_AT_MOST = 2  # settings in a label; where there are more the file's name stands for them
+TOLD_AT_MOST = 2  # a label names at most so many settings; with more it has the file's name instead
 FACTS = ("agent", "objects", "config", "weights", "scenes", "commit", "machine")
 
 Take = Callable[[Topic, str | None, Message], None]
@@ -28,7 +29,7 @@ Take = Callable[[Topic, str | None, Message], None]
 
 @dataclass(frozen=True)
 class Results:
-    """A file of `saccade bench`. `label` tells it from the others of a report."""
+    """A results file of `saccade bench`. Its `label` differs from the labels of the other files of a report."""
 
     path: Path
     facts: dict[str, Any]
@@ -47,12 +48,12 @@ class Results:
 
     @property
     def suite(self) -> str:
-        """The name of the scenes: the suite's, else the file's."""
+        """The name of the scenes: that of the suite if there is one, else that of the file."""
         return self.facts["scenes"].get("suite") or self.facts["scenes"]["file"]
 
 
 def read_results(path: Path) -> Results:
-    """Raises SaccadeError for a file that is none, or holds no result."""
+    """Reads a results file. Raises SaccadeError if it is not one of `saccade bench`, or if it holds no result."""
     try:
         tree = json.loads(path.read_text())
         records, facts = tree["results"], {key: tree[key] for key in FACTS}
@@ -70,8 +71,8 @@ def read_results(path: Path) -> Results:
 
 
 def told_otherwise(base: dict[str, Any], other: dict[str, Any]) -> list[str]:
-    """The keys in which a configuration tells the agent or its world something else than another, with their values;
-    which scenes, and over which bus, is not of these."""
+    """Returns the keys, with their values, in which the configuration `other` differs from `base` for the agent or its
+    world. The scenes, the bus and the seed are not compared."""
     mine, theirs = (_flat({key: value for key, value in tree.items() if key not in ("scene", "bus", "seed")})
                     for tree in (base, other))
     return [f"{key}={theirs[key]}" for key in theirs if key in mine and theirs[key] != mine[key]]
@@ -86,20 +87,21 @@ def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Again:
-    """What it takes to run scenes of a results file again."""
+    """What is needed to run scenes of a results file again."""
 
     results: Results
     config: Config
     scenes: tuple[Scene, ...]
 
     def arguments(self, scene_id: str) -> tuple[str, str, int]:
-        """What `replay` takes for that scene."""
+        """Returns the arguments of `replay` for that scene."""
         number = next(k for k, scene in enumerate(self.scenes) if scene.id == scene_id)
         return self.results.agent, self.config.model_dump_json(), number
 
 
 def prepare_again(results: Results, folder: Path, weights: Path | None = None) -> Again:
-    """Finds (or draws into `folder`) the scenes and the weights. Raises SaccadeError where they are not the same."""
+    """Finds the scenes (or draws them into `folder`) and the weights. Raises SaccadeError if they are not the same as
+    in the results."""
     config = validate(results.facts["config"], str(results.path))
     folder_of_weights = weights or config.perception.weights
     if folder_of_weights is not None:
@@ -113,7 +115,8 @@ def prepare_again(results: Results, folder: Path, weights: Path | None = None) -
 
 
 def _scenes_file(results: Results, config: Config, folder: Path) -> Path:
-    """The file where it was, beside the results or in the present folder; else the suite, drawn once more."""
+    """Returns the file of the scenes: at its place in the repository, beside the results, or in the present folder. If
+    it is nowhere, the suite is drawn again. Raises SaccadeError if no file holds the same scenes."""
     wanted = results.facts["scenes"]
 
     def candidates() -> Iterator[Path]:
@@ -129,7 +132,8 @@ def _scenes_file(results: Results, config: Config, folder: Path) -> Path:
 
 
 def replay(agent: str, config_text: str, number: int, take: Take | None = None) -> Story:
-    """Episode `number` within this process; `take` sees its messages. The last view is the one that was reached."""
+    """Runs episode `number` within this process. `take` sees its messages. The last view in the story is the one that
+    was reached."""
     config, pairs = cores(agent, config_text)
     story = Story(number)
 
@@ -139,7 +143,7 @@ def replay(agent: str, config_text: str, number: int, take: Take | None = None) 
             take(topic, part, message)
 
     run_local(pairs, config.names, RUN, (number,), hear)
-    simulator: Any = pairs[0][1]  # the last move has no frame
+    simulator: Any = pairs[0][1]  # no frame is published after the last move
     story.last_rgb, story.last_step = simulator.world.render(simulator.state.camera), simulator.state.step
     story.goal_is_known = story.goal_rgb is not None
     return story

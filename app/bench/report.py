@@ -1,4 +1,4 @@
-"""`saccade report`: results files as a Markdown page with pictures, the paper's figures beside ours."""
+"""`saccade report` turns results files into a Markdown page with pictures, with the paper's figures beside ours."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ REPORT_NAME, FAILURES_NAME, FOLDER = "report.md", "failures.md", "report"
 
 def report(paths: Sequence[Path], out: Path, *, failures: bool = False, reruns: bool = True,
            weights: Path | None = None, jobs: int = 1, console: Console) -> None:
-    """Writes `out`/report.md and its pictures; with `failures` also failures.md, for which every failed scene is run
-    again. Without `reruns` there are no pictures of episodes."""
+    """Writes `out`/report.md and its pictures. With `failures` it also writes failures.md, for which every failed scene
+    is run again. Without `reruns` there are no pictures of episodes. Raises SaccadeError if no results are given."""
     enforce_one_thread()
-    paths = [path for path in paths if not path.name.endswith(SCENES_ENDING)]  # they lie beside results
+    paths = [path for path in paths if not path.name.endswith(SCENES_ENDING)]  # scenes lie beside results
     if not paths:
         raise SaccadeError("no results are given: name files that `saccade bench` has written")
     files = labelled([read_results(path) for path in paths])
@@ -56,15 +56,16 @@ def report(paths: Sequence[Path], out: Path, *, failures: bool = False, reruns: 
         _write(out / REPORT_NAME, lines, console)
         if failures:
             page = ["# Failures", "",
-                    "Every failed scene, run again with the truth at hand, under the first thing that went wrong.", ""]
+                    "Every failed scene was run again and compared with the truth. The scenes are sorted by the first "
+                    "thing that went wrong.", ""]
             for file in files:
                 page += _failed(file, again[file.path], out, jobs, console)
             _write(out / FAILURES_NAME, page, console)
 
 
 def labelled(files: Sequence[Results]) -> list[Results]:
-    """The oracle last, as the floor; labels told apart where two files have the same. Raises SaccadeError for two files
-    of one name: their pictures would be too."""
+    """Puts the oracle last, because it is the floor, and makes equal labels different. Raises SaccadeError if two files
+    have the same name, because their pictures would have the same name too."""
     stem, often = Counter(file.path.stem for file in files).most_common(1)[0]
     if often > 1:
         raise SaccadeError(f"{often} results files are called {stem}: rename all but one")
@@ -74,7 +75,7 @@ def labelled(files: Sequence[Results]) -> list[Results]:
 
 
 def origins(files: Sequence[Results]) -> list[str]:
-    """Where each results file comes from."""
+    """Says where each results file comes from."""
     lines = ["| results | file | scenes | sha256 of the scenes | commit | weights | processor |",
              "| --- | --- | ---: | --- | --- | --- | --- |"]
     for file in files:
@@ -87,7 +88,8 @@ def origins(files: Sequence[Results]) -> list[str]:
 
 
 def success_and_errors(files: Sequence[Results]) -> list[str]:
-    """All results and the paper's in one table, then the paper's table for each: target by target, theirs beside."""
+    """Puts all results and the paper's into one table. Then follows the paper's table for each file: target by target,
+    with the paper's figures beside ours."""
     measures = ["success (%)", *MEASURES.values()]
     lines = ["## Success and errors", "", "Success with Wilson's 95 % interval; errors as mean ± standard error.", "",
              "| agent, objects, scenes | " + " | ".join(measures) + " |", "| --- |" + " ---: |" * len(measures)]
@@ -130,8 +132,8 @@ def _paper_cells(figures: Figures | None) -> list[str]:
 
 
 def side_by_side(files: Sequence[Results]) -> list[str]:
-    """For files of the same scenes: what is different in each, and scene by scene what it did to success. The first
-    file is what the others are compared with."""
+    """Compares files of the same scenes: what is different in each, and what that changed in the success of each scene.
+    The others are compared with the first file."""
     groups: dict[str, list[Results]] = {}
     for file in files:
         groups.setdefault(file.facts["scenes"]["sha256"], []).append(file)
@@ -156,7 +158,7 @@ def side_by_side(files: Sequence[Results]) -> list[str]:
 
 
 def differences(base: Results, other: Results) -> list[str]:
-    """What another run was told differently: the agent, the weights, or keys of the configuration."""
+    """Returns what is different in another run: the agent, the weights, or keys of the configuration."""
     found = [] if base.agent == other.agent else [f"agent {other.agent}"]
     found += told_otherwise(base.facts["config"], other.facts["config"])
     changed = base.facts["weights"] != other.facts["weights"] and base.agent == other.agent
@@ -164,7 +166,7 @@ def differences(base: Results, other: Results) -> list[str]:
 
 
 def plots(files: Sequence[Results], out: Path) -> list[str]:
-    """Draws what the results alone tell."""
+    """Draws the plots that need the results alone."""
     shown = {"errors": (pictures.draw_errors, "Errors of the last view; triangles are means"),
              "objects": (pictures.draw_objects, "Success against the number of objects on the table"),
              "steps": (pictures.draw_steps, "Goals reached within so many steps")}
@@ -176,11 +178,12 @@ def plots(files: Sequence[Results], out: Path) -> list[str]:
 
 
 def conduct(files: Sequence[Results]) -> list[str]:
-    """Steps, the agent's own word, and what a step costs."""
-    lines = ["## Steps, the agent's own word, time", "",
-             "Declared: the agent said that it was there. A false alarm: it was not, when it first said so. Episodes "
-             "that end at the goal, as the paper's do, tell of false alarms only; with `simulator.until=declared` they "
-             "end at the agent's word: reached is then the any-time success until it gave it.", "",
+    """Describes the steps, what the agent says about its arrival, and what a step costs."""
+    lines = ["## Steps, declarations, time", "",
+             "Declared means that the agent said that it had arrived. A false alarm means that it had not arrived when "
+             "it first said so. An episode that ends at the goal, as the paper's do, can show false alarms only. With "
+             "`simulator.until=declared` an episode ends when the agent says that it has arrived. Reached then means "
+             "that the camera was within tolerance at some step until that moment.", "",
              "| results | median steps (interquartile range) | reached (%) | declared (%) | rightly, of those (%) | "
              "declared and right, of all (%) | false alarms, of all (%) | milliseconds per step |",
              "| --- | ---: | ---: | ---: | ---: | ---: | ---: | --- |"]
@@ -198,7 +201,8 @@ def conduct(files: Sequence[Results]) -> list[str]:
 
 
 def training(files: Sequence[Results]) -> list[str]:
-    """What it took to train the weights, by their manifests; of those that are at hand, unchanged."""
+    """Says what the training of the weights took, according to their manifests. It covers weights that are at hand and
+    unchanged."""
     lines: dict[Path, str] = {}
     for file in files:
         folder = validate(file.facts["config"], str(file.path)).weights
@@ -219,7 +223,7 @@ def training(files: Sequence[Results]) -> list[str]:
 
 
 def _again(files: Sequence[Results], folder: Path, weights: Path | None) -> dict[Path, Again | SaccadeError]:
-    """What it takes to run each file's scenes again, or why that cannot be done."""
+    """Returns for each file what is needed to run its scenes again, or the error that says why this is not possible."""
     found: dict[Path, Again | SaccadeError] = {}
     for k, file in enumerate(files):
         (own := folder / str(k)).mkdir()
@@ -231,7 +235,7 @@ def _again(files: Sequence[Results], folder: Path, weights: Path | None) -> dict
 
 
 def _episodes(files: Sequence[Results], again: dict[Path, Any], out: Path, console: Console) -> list[str]:
-    """Galleries of all files, and the exploration of the first agent that keeps a belief."""
+    """Draws the galleries of all files, and the exploration of the first agent that keeps a belief."""
     lines, explored = ["## Goals and what was reached", ""], None
     for file in files:
         ready = again[file.path]
@@ -245,7 +249,7 @@ def _episodes(files: Sequence[Results], again: dict[Path, Any], out: Path, conso
             explored = pictures.explore(ready)
     if explored is not None:
         result = explored.story.result
-        assert result is not None  # as of every episode that was run to its end
+        assert result is not None  # every episode that ran to its end has one
         pictures.draw_exploration(explored, out / FOLDER / "exploration.png")
         lines += ["## Exploration", "", "Without a goal the camera goes where it expects to learn most about where the "
                   f"objects are. Scene {result.scene}.", "",

@@ -1,4 +1,4 @@
-"""Suites: the scenes that results are told about, by name. But for the paper's own, all are drawn from seeds."""
+"""Suites: named sets of scenes on which results are reported. All but the paper's own are drawn from seeds."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from saccade.shared.errors import SaccadeError
 Yaw = Literal["random", "fixed"]
 
 YAW_SEED, ROOM_SEED = 31_415_000, 27_182_000
-DEV_SEEDS: dict[Yaw, int] = {"fixed": 57_721_000, "random": 57_722_000}  # of halves: objects not turned, and turned
-ROOM_GOALS = 20  # of each target
-DEV_REPEATS = 2  # in each half
+DEV_SEEDS: dict[Yaw, int] = {"fixed": 57_721_000, "random": 57_722_000}  # of the halves without and with turned objects
+ROOM_GOALS = 20  # goals of each target
+DEV_REPEATS = 2  # repeats in each half
 
 
 @dataclass(frozen=True)
 class Suite:
-    """Scenes as `draw(sizes, seed of the run)` makes them; or those of a file, which are of one object set alone."""
+    """Scenes that `draw(sizes, seed of the run)` makes, or the scenes of a file, which belong to one object set."""
 
     draw: Callable[[Sizes, int], list[Scene]] | None = None
     file: Path | None = None
@@ -44,7 +44,8 @@ def _split(sizes: Sizes, seed: int, yaw: Yaw, repeats: int = 20) -> list[Scene]:
 
 
 def _room(sizes: Sizes, _seed: int) -> list[Scene]:
-    """One table with all objects, never turned, and goals by the paper's rule: its comparison with LEXA."""
+    """One table with all objects, never turned, and goals by the paper's rule. It repeats the paper's comparison with
+    LEXA."""
     rng, names = np.random.default_rng(ROOM_SEED), tuple(sizes)
     room = generate_scene(rng, sizes, names[0], len(names), yaw="fixed")
     present = [placed.name for placed in room.objects]
@@ -56,7 +57,7 @@ def _room(sizes: Sizes, _seed: int) -> list[Scene]:
 
 
 def _dev(sizes: Sizes, _seed: int) -> list[Scene]:
-    """For tuning: nothing else is."""
+    """The scenes for tuning. No other scenes are used for it."""
     return [scene for yaw, seed in DEV_SEEDS.items() for scene in _split(sizes, seed, yaw, DEV_REPEATS)]
 
 
@@ -71,14 +72,14 @@ SUITES = {
 
 
 def default_suite(objects: str) -> str:
-    """The paper's scenes for its objects, a split drawn like it for others."""
+    """The paper's scenes for the paper's objects. For other objects, scenes that are drawn by the same rules."""
     return "paper-500" if objects == SUITES["paper-500"].objects else "paper-like"
 
 
 def suite_file(name: str, config: Config, beside: Path) -> Path:
-    """The file with a suite's scenes: its own, or `beside`, written here.
+    """Returns the file with a suite's scenes: its own file, or `beside`, which is then written here.
 
-    Raises SaccadeError for an unknown suite and for one that is not of the configured objects.
+    Raises SaccadeError if the suite is unknown, or if it is not of the configured objects.
     """
     if name not in SUITES:
         raise SaccadeError(f"suite {name!r} is unknown: choose from {', '.join(SUITES)}")
@@ -90,6 +91,6 @@ def suite_file(name: str, config: Config, beside: Path) -> Path:
     if suite.file is not None:
         return suite.file
     sizes = {each: load_mesh(scene.objects, each).size_m for each in names_in_use(scene)}
-    assert suite.draw is not None  # each suite has the one or the other
+    assert suite.draw is not None  # a suite without a file has `draw`
     save_scenes(beside, suite.draw(sizes, config.seed))
     return beside

@@ -1,4 +1,4 @@
-"""The benchmark's table: what the paper reports (section 4.2), ours beside it. Pure functions of the results."""
+"""The benchmark's table: what the paper reports (section 4.2), and our figures beside it. All functions are pure."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rich.table import Table
 
 Record = Mapping[str, Any]
 
-Z_95 = 1.959963984540054  # of the standard normal distribution
+Z_95 = 1.959963984540054  # quantile 0.975 of the standard normal distribution
 MEASURES = {"azimuth_error_rad": "azimuth (rad)", "elevation_error_rad": "elevation (rad)",
             "range_error_m": "range (m)"}
 TOTAL = "Total"
@@ -20,11 +20,11 @@ TOTAL = "Total"
 
 @dataclass(frozen=True)
 class Figures:
-    """One row of the paper's table, SceneCCN + AIF: success in percent, mean errors in the order of MEASURES."""
+    """One row of the paper's table: success in percent, and the mean errors in the order of MEASURES."""
 
     success_percent: float
     means: tuple[float, float, float]
-    errors: tuple[float, float, float] | None = None  # standard errors, where the paper gives them
+    errors: tuple[float, float, float] | None = None  # standard errors, if the paper gives them
 
 
 PAPER = {
@@ -36,17 +36,17 @@ PAPER = {
     TOTAL: Figures(69.0, (0.569, 0.231, 0.067), (0.034, 0.014, 0.004)),
 }
 
-PAPER_AGENTS = {  # all its agents on its 500 scenes
+PAPER_AGENTS = {  # all agents of the paper on its 500 scenes
     "PoseCNN (uses depth)": Figures(16.2, (1.277, 0.431, 0.186), (0.042, 0.015, 0.007)),
     "PoseCNN + Infogain": Figures(28.4, (1.119, 0.367, 0.150), (0.045, 0.015, 0.007)),
     "SceneCCN + AIF": PAPER[TOTAL],
 }
-PAPER_ROOM = {"PoseCNN": 17, "PoseCNN + Infogain": 30, "SceneCCN": 62, "LEXA (about 7 M steps)": 11}  # percent of 100
+PAPER_ROOM = {"PoseCNN": 17, "PoseCNN + Infogain": 30, "SceneCCN": 62, "LEXA (about 7 M steps)": 11}  # of 100 goals
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A value with its 95 % interval; for means also the standard error (None for fewer than two samples)."""
+    """A value with its 95 % interval. A mean also has a standard error, which is None for fewer than two samples."""
 
     value: float
     low: float
@@ -56,8 +56,9 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Row:
-    """What one target (or all of them) came to. Shares are fractions, of all scenes; `declared_true` of those in which
-    the agent said that it was there. A false alarm is one in which it was not, when it first said so."""
+    """The results of one target, or of all of them. Shares are fractions of all scenes; only `declared_true` is a
+    fraction of the scenes in which the agent said that it had arrived. A false alarm is a scene in which it had not
+    arrived when it first said so."""
 
     name: str
     scenes: int
@@ -71,7 +72,8 @@ class Row:
 
 
 def wilson(successes: int, trials: int) -> Estimate:
-    """Share of successes with Wilson's score interval. Raises ValueError without trials."""
+    """Share of successes with Wilson's score interval. Raises ValueError if there are no trials, or more successes than
+    trials."""
     if not 0 <= successes <= trials or trials == 0:
         raise ValueError(f"{successes} successes of {trials} trials")
     share, square = successes / trials, Z_95 ** 2
@@ -81,7 +83,7 @@ def wilson(successes: int, trials: int) -> Estimate:
 
 
 def mean(values: Sequence[float]) -> Estimate:
-    """Mean with its standard error and the normal interval; of a single value no more than the value is known."""
+    """Mean with its standard error and the normal 95 % interval. For a single value, error and interval are unknown."""
     value = fmean(values)
     if len(values) < 2:
         return Estimate(value, math.nan, math.nan)
@@ -90,7 +92,7 @@ def mean(values: Sequence[float]) -> Estimate:
 
 
 def summarise(name: str, records: Sequence[Record]) -> Row:
-    """The row of some results (at least one)."""
+    """Returns the row of some results (at least one)."""
     low, middle, high = quartiles([r["steps"] for r in records])
     declared = [r for r in records if r["declared"]]
     rightly = sum(r["declared_true"] for r in declared)
@@ -101,13 +103,14 @@ def summarise(name: str, records: Sequence[Record]) -> Row:
 
 
 def quartiles(values: Sequence[float]) -> tuple[float, float, float]:
-    """First quartile, median and third quartile, between neighbours where they fall between two values."""
+    """First quartile, median and third quartile. A quartile that falls between two values is interpolated."""
     low, middle, high = quantiles([*values, *values] if len(values) == 1 else values, n=4, method="inclusive")
     return low, middle, high
 
 
 def milliseconds(records: Sequence[Record]) -> dict[str, float]:
-    """Mean milliseconds per step of each service, over all steps of these results; of none where none were measured."""
+    """Mean milliseconds per step of each service, over all steps of these results. It is empty if none were
+    measured."""
     measured = [r for r in records if r.get("milliseconds")]
     services = dict.fromkeys(service for r in measured for service in r["milliseconds"])
     sums = {s: [(r["milliseconds"][s] * r["steps"], r["steps"]) for r in measured if s in r["milliseconds"]]
@@ -116,14 +119,15 @@ def milliseconds(records: Sequence[Record]) -> dict[str, float]:
 
 
 def rows(records: Sequence[Record]) -> list[Row]:
-    """One row per target, in the order of their first scene, and the total."""
+    """One row for each target, in the order of their first scenes, and the total."""
     targets = dict.fromkeys(r["target"] for r in records)
     parts = [summarise(name, [r for r in records if r["target"] == name]) for name in targets]
     return [*parts, summarise(TOTAL, records)]
 
 
 def render(records: Sequence[Record], *, title: str) -> Table:
-    """The table for the terminal: three lines a target, ours, its 95 % interval, and the paper's where it has one."""
+    """Makes the table for the terminal. A target has three lines: our figures, their 95 % intervals, and the paper's
+    figures if it has any."""
     theirs = "paper" if any(r["target"] in PAPER for r in records) else "paper (YCB)"
     caption = "± is the standard error of the mean; 95 % intervals: Wilson for success, normal for means"
     caption += "; of the steps: interquartile range\ndeclared: the agent said that it was there; rightly: of those, "

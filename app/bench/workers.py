@@ -21,11 +21,12 @@ Results = Iterator[tuple[str, Any]]
 
 
 def in_processes(function: Callable[..., Any], work: Work, jobs: int, cluster: str | None = None) -> Results:
-    """(scene, function(*arguments)) as they are ready, for the scenes in `work`: `jobs` at a time here, or as many as
-    the Ray cluster at that address (`ray://host:10001`) has cores; its nodes need the same checkout in the same place.
+    """Yields (scene, function(*arguments)) for the scenes in `work`, as they become ready. On this machine `jobs` of
+    them run at a time. On a Ray cluster, whose address is `cluster` (`ray://host:10001`), as many run as it has cores.
+    Its nodes need the same checkout in the same place.
 
-    The function and what it returns must be picklable. An interruption ends them all. Raises SaccadeError, with the
-    scene, for one that cannot be worked on, and if a process has died.
+    The function and what it returns must be picklable. An interruption ends all processes. Raises SaccadeError, which
+    names the scene, if a scene cannot be worked on, and also if a process has died.
     """
     if not work:
         return
@@ -50,14 +51,14 @@ def _here(function: Callable[..., Any], work: Work, jobs: int) -> Results:
     try:
         yield from parallel(delayed(_named)(function, scene, arguments) for scene, arguments in work.items())
     except TerminatedWorkerError as error:
-        raise SaccadeError("one of the processes has died, perhaps for want of memory: give the same command again, "
+        raise SaccadeError("one of the processes has died, perhaps for lack of memory: give the same command again, "
                            "with fewer --jobs") from error
     finally:
         get_reusable_executor().shutdown(wait=False, kill_workers=True)
 
 
 def _follow_the_parent() -> None:
-    """Ctrl-C is the parent's to handle; without one there is nobody to work for."""
+    """Makes a worker leave Ctrl-C to its parent, and end when its parent is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = os.getppid()
 
@@ -81,7 +82,7 @@ def _on_ray(function: Callable[..., Any], work: Work, cluster: str) -> Results:
     try:
         try:
             join()
-        except ConnectionAbortedError:  # it is there, but was too slow to make room
+        except ConnectionAbortedError:  # the cluster is there, but was too slow
             join()
     except (ConnectionError, ValueError, RuntimeError) as error:
         raise SaccadeError(f"no Ray cluster answers at {cluster}: {str(error).strip().splitlines()[-1]}") from error

@@ -1,4 +1,4 @@
-"""`saccade echo`: messages as text, a block each, also those that are no good."""
+"""`saccade echo` prints messages as text, a block for each. Malformed messages are shown too."""
 
 from __future__ import annotations
 
@@ -18,12 +18,13 @@ from saccade.app.look.listen import Heard, Live, Logged, Wanted, live, until_int
 from saccade.shared.bus.messages import Message
 from saccade.shared.bus.wire import MessageError, decode
 
-MOST_NUMBERS = 16  # of an array that is told in full
+MOST_NUMBERS = 16  # an array with at most so many numbers is printed in full
 HEADER = ("run", "episode", "step", "seq")
 
 
 def echo(key: str, *, log: Path | None, count: int | None, endpoint: str | None, run: Path | None) -> None:
-    """Prints what comes on the keys of a pattern, live or from a log. Raises SaccadeError where nothing can come."""
+    """Prints the messages on the keys that match a pattern, from a running run or from a log. Raises SaccadeError if no
+    message can come."""
     wanted = Wanted.parse(key)
     try:
         if log is not None:
@@ -32,12 +33,12 @@ def echo(key: str, *, log: Path | None, count: int | None, endpoint: str | None,
             with closing(live(wanted, endpoint=endpoint, run=run)) as source:
                 show(source, count)
         sys.stdout.flush()
-    except BrokenPipeError:  # whoever read has seen enough
+    except BrokenPipeError:  # the reader of the output has closed it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def show(source: Live | Logged, count: int | None, write: Callable[[str], Any] = print) -> int:
-    """Writes up to `count` messages and says what was dropped; returns how many were shown."""
+    """Writes up to `count` messages, and says how many were dropped. Returns how many were shown."""
     shown, told = 0, 0
     with until_interrupted(source.stop) if isinstance(source, Live) else nullcontext():
         for heard in source.heard():
@@ -61,7 +62,7 @@ def _say_dropped(source: Live | Logged, told: int, write: Callable[[str], Any]) 
 
 
 def block(heard: Heard, world: str) -> Iterator[str]:
-    """The lines of one message."""
+    """Yields the lines of one message."""
     when = datetime.fromtimestamp(heard.time_ns / 1e9, UTC).strftime("%H:%M:%S.%f")[:-3]
     title = f"{heard.topic.key(world, heard.part)}  {when} UTC, {len(heard.payload):,} bytes"
     try:
@@ -74,14 +75,14 @@ def block(heard: Heard, world: str) -> Iterator[str]:
 
 
 def fields(message: Message) -> Iterator[str]:
-    """A line for every field."""
+    """Yields a line for every field."""
     for field in dataclasses.fields(message):
         if field.name not in HEADER:
             yield f"  {field.name}: {told(getattr(message, field.name))}"
 
 
 def told(value: Any) -> str:
-    """A value as one line."""
+    """Returns a value as one line."""
     if isinstance(value, np.ndarray):
         return of_array(value)
     if isinstance(value, list):
@@ -92,7 +93,8 @@ def told(value: Any) -> str:
 
 
 def of_array(value: np.ndarray) -> str:
-    """Type and shape, then all numbers of a small one, else the least, the mean and the greatest."""
+    """Describes an array: its type and shape, then all its numbers if they are few, else the minimum, the mean and the
+    maximum."""
     kind = f"{value.dtype.str[1:]} {list(value.shape)}"
     if value.size == 0:
         return f"{kind}, empty"
@@ -108,5 +110,6 @@ def _number(value: Any) -> str:
 
 
 def text(words: str) -> str:
-    """Words as they are, unless they would do something to a terminal."""
+    """Returns words as they are if they are printable. Otherwise they are escaped, so that they cannot control a
+    terminal."""
     return words if words.isprintable() else repr(words)

@@ -1,5 +1,5 @@
-"""`saccade film`: an episode as a short film, from its log: what the camera sees, where things are believed to be, and
-the view that is planned, step by step."""
+"""`saccade film` turns one episode of a log into a short film. Step by step it shows what the camera sees, where the
+objects are believed to be, and which view is planned."""
 
 from __future__ import annotations
 
@@ -31,29 +31,30 @@ from saccade.shared.errors import SaccadeError
 from saccade.shared.log.reading import RunReader
 from saccade.shared.model.weights import Weights
 
-INCHES, DPI = (12.8, 7.2), 100  # both sides are an even number of pixels, as video wants them
+INCHES, DPI = (12.8, 7.2), 100  # both sides must be an even number of pixels for H.264
 GIF_DPI, GIF_COLOURS = 60, 96
-LAST_S = 2.0  # the end stays so long
+LAST_S = 2.0  # the last picture stays for so long
 SUFFIXES = (".mp4", ".gif")
 
 Picture = NDArray[np.uint8]
-Write = Callable[[Picture, int], None]  # a picture, and for how many frames it stays
+Write = Callable[[Picture, int], None]  # writes a picture for a number of frames
 
 
 @dataclass
 class Scene:
-    """What an episode has told so far."""
+    """What the messages of an episode have told up to the present step."""
 
     story: Story
-    percepts: dict[str, Percept] = field(default_factory=dict)  # of this step
-    seen: dict[str, Percept] = field(default_factory=dict)  # the last that saw the object
-    believed_m: dict[int, float] = field(default_factory=dict)  # by step: how far the goal is believed to be,
-    true_m: dict[int, float] = field(default_factory=dict)  # how far it is,
-    entropies: dict[str, dict[int, float]] = field(default_factory=dict)  # and each position's entropy, nats
+    percepts: dict[str, Percept] = field(default_factory=dict)  # of the present step
+    seen: dict[str, Percept] = field(default_factory=dict)  # the last percept of each object that saw it
+    believed_m: dict[int, float] = field(default_factory=dict)  # by step: the believed distance to the goal
+    true_m: dict[int, float] = field(default_factory=dict)  # by step: the true distance
+    # By object and step: entropy of the position, nats
+    entropies: dict[str, dict[int, float]] = field(default_factory=dict)
     words: str = ""
 
     def take(self, topic: Topic, part: str | None, message: Message) -> None:
-        """Notes what a message of this episode says."""
+        """Stores what a message of this episode says."""
         if topic == FRAME:
             self.percepts = {}
         self.story.take(part, message)
@@ -75,10 +76,11 @@ class Scene:
 
 
 def film(log: Path, out: Path, *, episode: int | None, rate_hz: float, console: Console) -> None:
-    """Writes an episode of a log, the last unless another is asked for. Raises SaccadeError for what is no log, an
-    episode that is not in it, and a file of another kind than MP4 or GIF."""
+    """Writes one episode of a log as a film to `out`, `rate_hz` steps per second. Without `episode` it is the last one.
+    Raises SaccadeError if `log` is not a log, if the episode is not in it, or if `out` is neither an .mp4 nor a .gif
+    file."""
     if out.suffix.lower() not in SUFFIXES:
-        raise SaccadeError(f"{out} is no film's name: let it end with {' or '.join(SUFFIXES)}")
+        raise SaccadeError(f"{out} cannot be a film: its name must end with {' or '.join(SUFFIXES)}")
     log = log_of(log)
     steps = steps_of(log)
     episode = max(steps, default=0) if episode is None else episode
@@ -97,7 +99,7 @@ def film(log: Path, out: Path, *, episode: int | None, rate_hz: float, console: 
 
 
 def steps_of(log: Path) -> dict[int, int]:
-    """How many frames each episode of a log has."""
+    """Counts the frames of each episode of a log."""
     steps: dict[int, int] = {}
     for topic, _, message in RunReader(log):
         if topic == FRAME:
@@ -106,7 +108,8 @@ def steps_of(log: Path) -> dict[int, int]:
 
 
 def scenes(log: Path, episode: int) -> Iterator[tuple[Scene, Imagination | None]]:
-    """The scene at the end of each step, and once more when the episode is over."""
+    """Yields the scene at the end of each step, and once more at the end of the episode. With it comes the object that
+    draws the planned view, or None if the weights are missing."""
     reader, scene, imagination, begun = RunReader(log), Scene(Story(episode)), None, False
     for topic, part, message in reader:
         if not begun:
@@ -122,7 +125,7 @@ def scenes(log: Path, episode: int) -> Iterator[tuple[Scene, Imagination | None]
 
 
 def imagination_of(config: Config) -> Imagination | None:
-    """What draws the planned view; nothing where the weights are not there."""
+    """Returns the object that draws the planned view, or None if the weights are missing."""
     try:
         return Imagination(Weights(config.weights), config.names)
     except SaccadeError:
@@ -130,7 +133,7 @@ def imagination_of(config: Config) -> Imagination | None:
 
 
 def picture_of(scene: Scene, imagination: Imagination | None, dpi: int) -> Picture:
-    """One frame of the film [H, W, 3]."""
+    """Draws one frame of the film: an array [H, W, 3] of uint8."""
     figure, story = new_figure(INCHES, dpi), scene.story
     grid = figure.add_gridspec(3, 3, height_ratios=(1, 1, 0.9), width_ratios=(1.25, 1.25, 0.62))
     of_object = colours(story.beliefs)
@@ -145,13 +148,13 @@ def picture_of(scene: Scene, imagination: Imagination | None, dpi: int) -> Pictu
     _curves(figure, grid, scene, of_object)
     figure.suptitle(f"step {story.last_step}    {scene.words}", x=0.02, ha="left", fontsize=13)
     canvas = figure.canvas
-    assert isinstance(canvas, FigureCanvasAgg)  # as of every new figure
+    assert isinstance(canvas, FigureCanvasAgg)  # new_figure makes one
     canvas.draw()
     return np.ascontiguousarray(np.asarray(canvas.buffer_rgba())[..., :3])
 
 
 def _camera(axes: Axes, scene: Scene, imagination: Imagination | None, of_object: dict[str, str]) -> None:
-    """What the camera sees: mask and name of each object in it, and the crop that its network looks at."""
+    """Draws what the camera sees. Each object in it gets its mask, its name, and the crop that its network looks at."""
     rgb = scene.story.last_rgb
     image(axes, rgb, "camera")
     if rgb is None:
@@ -173,7 +176,7 @@ def _camera(axes: Axes, scene: Scene, imagination: Imagination | None, of_object
 
 
 def _table(axes: Axes, scene: Scene) -> None:
-    """Particles, the path, the candidates and the chosen viewpoint, from above."""
+    """Draws the table from above: the particles, the path, the candidates and the chosen viewpoint."""
     story = scene.story
     table_from_above(axes, "belief, from above")
     particles(axes, {n: b for n, b in story.beliefs.items() if b.presence > PRESENT_ABOVE}, story.beliefs)

@@ -1,4 +1,4 @@
-"""`saccade hz`: how often messages come, and how evenly."""
+"""`saccade hz` shows how often messages come, and how regularly."""
 
 from __future__ import annotations
 
@@ -22,21 +22,22 @@ from saccade.app.run.display import say
 from saccade.shared.bus.topics import Topic
 
 WINDOW_S = 10.0
-MOST = 10_000  # messages of one key that a window holds
+MOST = 10_000  # a window holds at most so many messages of one key
 LINES_EVERY_S = 1.0
 
 
 @dataclass
 class Rate:
-    """The messages of one key: `count` in all, and the times (s) and sizes of those in the window."""
+    """The messages of one key: `count` is the number of all, and `recent` holds the times (s) and sizes (bytes) of
+    those in the window."""
 
     count: int = 0
     recent: deque[tuple[float, int]] = field(default_factory=lambda: deque(maxlen=MOST))
 
     def values(self) -> tuple[int, float, float, float, float]:
-        """Count; rate (1/s), mean interval (s), its standard deviation (s) and bytes per second within the window, all
-        NaN while it has no two messages at different times."""
-        times = sorted(at for at, _ in self.recent)  # what was asked for again stands in a log out of its turn
+        """Returns the count, and for the window: the rate (1/s), the mean interval (s), its standard deviation (s) and
+        the bytes per second. These are NaN while the window does not hold two messages with different times."""
+        times = sorted(at for at, _ in self.recent)  # in a log, messages that were asked for again come later
         span = times[-1] - times[0] if times else 0.0
         if span <= 0:
             return self.count, math.nan, math.nan, math.nan, math.nan
@@ -48,7 +49,7 @@ class Rate:
 
 
 class Rates:
-    """Rates by key, of the last `window_s` seconds. Safe between threads."""
+    """The rates of all keys over the last `window_s` seconds. It is safe between threads."""
 
     def __init__(self, window_s: float = math.inf, most: int | None = MOST) -> None:
         self.total, self._window_s, self._most = 0, window_s, most
@@ -56,7 +57,7 @@ class Rates:
         self._lock = threading.Lock()
 
     def take(self, topic: Topic, part: str | None, size: int, at_s: float) -> None:
-        """One message of `size` bytes that came at a time."""
+        """Counts one message of `size` bytes that came at the time `at_s`."""
         with self._lock:
             rate = self._rates.setdefault((topic, part), Rate(recent=deque(maxlen=self._most)))
             rate.count += 1
@@ -64,7 +65,7 @@ class Rates:
             self.total += 1
 
     def rows(self, world: str, now_s: float = -math.inf) -> list[tuple[str, ...]]:
-        """Key, count, rate, mean interval, jitter and bytes per second, as text."""
+        """Returns a row of texts for each key: key, count, rate, mean interval, jitter and bytes per second."""
         with self._lock:
             for rate in self._rates.values():
                 while rate.recent and rate.recent[0][0] < now_s - self._window_s:
@@ -75,7 +76,8 @@ class Rates:
 
 def hz(key: str, *, log: Path | None, count: int | None, endpoint: str | None, run: Path | None,
        console: Console | None = None) -> None:
-    """Shows rates until Ctrl-C or `count` messages, or those of a log. Raises SaccadeError where nothing can come."""
+    """Shows rates until Ctrl-C or until `count` messages have come, or the rates of a log. Raises SaccadeError if no
+    message can come."""
     console, wanted = console or Console(), Wanted.parse(key)
     if log is None:
         with closing(live(wanted, endpoint=endpoint, run=run)) as source:
@@ -92,7 +94,7 @@ def hz(key: str, *, log: Path | None, count: int | None, endpoint: str | None, r
 
 
 def follow(source: Live, count: int | None, console: Console) -> Rates:
-    """Shows the rates of what comes on a bus. Nothing waits in a queue here, so nothing is dropped."""
+    """Shows the rates of what comes on a bus. There is no queue here, so nothing is dropped."""
     rates, told_s = Rates(WINDOW_S), time.monotonic()
     source.listen(lambda topic, part, payload: rates.take(topic, part, len(payload), time.monotonic()))
     with until_interrupted(source.stop), Display(console=console, auto_refresh=False, transient=True) as display:

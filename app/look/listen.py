@@ -1,4 +1,4 @@
-"""Listening to messages from outside: which ones, on a run's bus or in a log. A run never waits for who listens."""
+"""Listening to messages from outside, on the bus of a run or in a log. A run never waits for a listener."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from saccade.shared.log.reading import RunReader
 from saccade.shared.loop.process import Inbox
 
 RUNS = Path("runs")
-QUEUE_BYTES = 64 * 1024 * 1024  # of messages that wait to be shown; what does not fit is dropped and counted
+QUEUE_BYTES = 64 * 1024 * 1024  # for messages that wait to be shown; what does not fit is dropped
 TICK_S = 0.2
 CONNECT_S = 3.0
 PROBE_S = 0.3
-NEWEST = 20  # run folders that are tried
+NEWEST = 20  # so many run folders are tried, the newest first
 
 
 class Heard(NamedTuple):
-    """A message as it was on the wire, and when it came (ns)."""
+    """A message as it was on the bus, and the time at which it came (ns)."""
 
     topic: Topic
     part: str | None
@@ -40,7 +40,7 @@ class Heard(NamedTuple):
 
 @dataclass(frozen=True)
 class Wanted:
-    """Which keys are listened to; `*` stands for anything. `world`: None where it was not said."""
+    """The keys that are listened to; `*` stands for anything. `world` is None if the user did not name one."""
 
     topic: str
     part: str
@@ -48,7 +48,7 @@ class Wanted:
 
     @classmethod
     def parse(cls, key: str) -> Wanted:
-        """Of a full key, or of topic[/part]. Raises SaccadeError where no key of ours can be meant."""
+        """Reads a full key, or topic[/part]. Raises SaccadeError if it cannot match any key of Saccade."""
         pieces = key.split("/")
         world = None
         if pieces[0] == ROOT and len(pieces) > 2:
@@ -61,19 +61,20 @@ class Wanted:
 
     @property
     def topics(self) -> list[Topic]:
-        """The topics it can mean."""
+        """The topics that it can match."""
         return [topic for topic in TOPICS.values()
                 if fnmatchcase(topic.name, self.topic) and (topic.parts or self.part in ("*", "**"))]
 
     def matches(self, topic: Topic, part: str | None) -> bool:
-        """Whether it means this key."""
+        """Whether it matches this key."""
         return topic in self.topics and (part is None or fnmatchcase(part, self.part))
 
 
 class Live:
-    """The messages of a bus while they are published: copied into a queue, or dropped and counted where that is full.
+    """The messages of a bus while they are published. They are copied into a queue. If the queue is full, new messages
+    are dropped and counted.
 
-    `endpoint`: the bus's address. Raises SaccadeError if nothing answers there.
+    `endpoint` is the address of the bus. Raises SaccadeError if nothing answers there.
     """
 
     def __init__(self, wanted: Wanted, endpoint: str, world: str, limit_bytes: int = QUEUE_BYTES) -> None:
@@ -82,12 +83,12 @@ class Live:
 
     @property
     def dropped(self) -> int:
-        """How many came while the queue was full."""
+        """How many messages came while the queue was full."""
         return self.inbox.dropped
 
     def heard(self) -> Iterator[Heard | None]:
-        """From now on until `stop`, with None now and then while nothing comes. What holds for the whole episode and
-        was published before is asked for first."""
+        """Yields messages from now on until `stop`, and None from time to time while nothing comes. The first ones are
+        messages that hold for the whole episode and were published before."""
         self.listen(self._put)
         known = set()
         for heard in self.earlier():
@@ -101,12 +102,12 @@ class Live:
                 yield Heard(*item, time.time_ns())
 
     def earlier(self) -> list[Heard]:
-        """What holds for the whole episode and was published before, as its publishers know it."""
+        """Asks the publishers for the messages that hold for the whole episode and were published before."""
         kept = self._bus.recall([topic for topic in self.wanted.topics if topic.latched])
         return [Heard(k.topic, k.part, k.payload, k.published_ns) for k in kept if self.wanted.matches(k.topic, k.part)]
 
     def listen(self, deliver: Callable[[Topic, str | None, bytes], None]) -> None:
-        """Calls `deliver` on the bus's thread for what is wanted; it must not wait."""
+        """Calls `deliver` for every wanted message, on the bus's thread. `deliver` must not wait."""
         def take(topic: Topic, part: str | None, payload: bytes) -> None:
             if self.wanted.matches(topic, part):
                 deliver(topic, part, payload)
@@ -114,7 +115,7 @@ class Live:
         self._bus.subscribe(self.wanted.topics, take)
 
     def stop(self) -> None:
-        """Ends `heard`. Safe in a signal handler."""
+        """Ends `heard`. It is safe in a signal handler."""
         self.inbox.stop()
 
     def close(self) -> None:
@@ -126,7 +127,8 @@ class Live:
 
 
 class Logged:
-    """The messages of a log. `world` is known with the first. Raises SaccadeError if it is none."""
+    """The messages of a log. Its `world` is known after the first message. Raises SaccadeError if the file is not a
+    log."""
 
     dropped = 0
 
@@ -135,11 +137,11 @@ class Logged:
 
     @property
     def world(self) -> str:
-        """The log's world."""
+        """The world of the log."""
         return self.reader.world
 
     def heard(self) -> Iterator[Heard]:
-        """From the first to the last. Raises SaccadeError where the world of the log is not the one wanted."""
+        """Yields the messages from the first to the last. Raises SaccadeError if the log is not of the wanted world."""
         for entry in self.reader.entries():
             if not fnmatchcase(self.world, self.wanted.world or "*"):
                 raise SaccadeError(f"log {self.reader.path} is of world {self.world!r}, not {self.wanted.world!r}")
@@ -148,14 +150,14 @@ class Logged:
 
 
 def live(wanted: Wanted, *, endpoint: str | None, run: Path | None) -> Live:
-    """The messages of a run that goes on, of `config_of`. Raises SaccadeError where none does."""
+    """Listens to a run that is going on; `config_of` says to which. Raises SaccadeError if there is none."""
     bus = config_of(endpoint=endpoint, run=run).bus
     return Live(wanted, bus.endpoint, bus.world if wanted.world in (None, "*") else wanted.world)
 
 
 def config_of(*, endpoint: str | None, run: Path | None) -> Config:
-    """The configuration of the run in a folder, or of the newest whose bus answers; of one at an endpoint nothing else
-    is known. Raises SaccadeError where there is none."""
+    """Returns the configuration of the run in a folder, or of the newest run whose bus answers. If only an endpoint is
+    given, nothing else is known about the run. Raises SaccadeError if there is no such run, or if both are given."""
     if endpoint is not None and run is not None:
         raise SaccadeError("--endpoint and --run both name a bus: give one of them")
     if endpoint is not None:
@@ -165,7 +167,7 @@ def config_of(*, endpoint: str | None, run: Path | None) -> Config:
 
 
 def on_bus(run: Path) -> Config:
-    """The configuration in a run's folder. Raises SaccadeError where the run had no bus."""
+    """Returns the configuration in a run's folder. Raises SaccadeError if the run had no bus."""
     config = load(run / CONFIG_NAME)
     if config.bus.kind != "zenoh" or config.bus.endpoint.endswith(":0"):
         raise SaccadeError(f"run {run} was within one process and has no bus: give its log with --log")
@@ -173,7 +175,7 @@ def on_bus(run: Path) -> Config:
 
 
 def newest_run(runs: Path = RUNS) -> Path:
-    """The folder of the newest run whose bus answers."""
+    """Returns the folder of the newest run whose bus answers. Raises SaccadeError if there is none."""
     with suppress(OSError):
         folders = sorted((path.stat().st_mtime_ns, path.parent) for path in runs.glob(f"*/{CONFIG_NAME}"))
         for _, folder in folders[:-NEWEST - 1:-1]:
@@ -184,7 +186,7 @@ def newest_run(runs: Path = RUNS) -> Path:
 
 
 def answers(endpoint: str) -> bool:
-    """Whether somebody listens at a TCP endpoint."""
+    """Whether something listens at a TCP endpoint."""
     match = re.fullmatch(r"tcp/\[?([^\[\]]+)\]?:(\d+)", endpoint)
     with suppress(OSError, OverflowError), socket.create_connection((match[1], int(match[2])) if match else ("", 0),
                                                                     timeout=PROBE_S):
@@ -194,7 +196,7 @@ def answers(endpoint: str) -> bool:
 
 @contextmanager
 def until_interrupted(stop: Callable[[], None]) -> Iterator[None]:
-    """Within it Ctrl-C and SIGTERM call `stop`, a second one ends the process at once."""
+    """Within this context, Ctrl-C and SIGTERM call `stop`. A second signal ends the process at once."""
     def on_signal(number: int, _frame: object) -> None:
         signal.signal(number, signal.SIG_DFL)
         stop()

@@ -1,5 +1,5 @@
-"""A run in one picture, from its log: the goal, the last view, the table from above with what was believed, and
-the free energy."""
+"""Draws a run as one picture, from its log: the goal, the last view, the table from above with the beliefs, and the
+free energy."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from saccade.shared.log.folder import LOG_NAME, PICTURE_NAME
 from saccade.shared.log.reading import RunReader
 
 INCHES, DPI = (21.0, 5.2), 100
-SHOWN_M = 0.62  # half the side of the view from above: the table and the camera's workspace
+SHOWN_M = 0.62  # half the side of the view from above, which shows the table and the camera's workspace
 PRESENT_ABOVE = 0.5
 F_TERMS = {"f_identity": "#264653", "f_position": "#2a9d8f", "f_crop": "#8ab17d", "f_pose": "#bcb8b1",
            "f_likelihood": "#e0ddd6"}  # in other colours than the objects'
@@ -33,14 +33,14 @@ TOLD = (GOAL, FRAME, BELIEF, TRUTH, PLAN, RESULT)
 
 @dataclass
 class Story:
-    """What the messages of one episode tell: images [H, W, 3], and for each step the camera's position [3] and the
-    terms of F summed over the objects [5], nats."""
+    """What the messages of one episode tell. Images are arrays [H, W, 3]. `ways` holds the camera's position [3] at
+    each step, in metres. `energies` holds the terms of F at each step, summed over the objects [5], in nats."""
 
     episode: int
     goal_rgb: NDArray[np.uint8] | None = None
-    goal_is_known: bool = False  # that its view is the truth's, not that of an image from elsewhere
+    goal_is_known: bool = False  # whether the truth has the goal's view: not if the user gave the image
     last_rgb: NDArray[np.uint8] | None = None
-    last_step: int = 0  # of `last_rgb`: the last move has no view of its own
+    last_step: int = 0  # the step of `last_rgb`; no frame follows the last move
     ways: dict[int, NDArray[np.float64]] = field(default_factory=dict)
     beliefs: dict[str, Belief] = field(default_factory=dict)
     energies: dict[int, NDArray[np.float64]] = field(default_factory=dict)
@@ -50,11 +50,11 @@ class Story:
 
     @property
     def path_m(self) -> list[NDArray[np.float64]]:
-        """The camera's positions in their order."""
+        """The camera's positions [3] in the order of the steps, in metres."""
         return [self.ways[step] for step in sorted(self.ways)]
 
     def take(self, part: str | None, message: Message) -> None:
-        """Notes what a message of this episode says."""
+        """Stores what a message of this episode says."""
         if isinstance(message, Goal):
             self.goal_rgb = message.rgb
         elif isinstance(message, Frame):
@@ -69,12 +69,12 @@ class Story:
             self.plan = message
         elif isinstance(message, Result):
             self.result = message
-        if isinstance(message, Frame | Truth):  # the last step has a truth and no frame, a real camera frames alone
+        if isinstance(message, Frame | Truth):  # the last step has no frame, and a real camera has no truth
             self.ways[message.step] = message.world_from_camera[:3, 3]
 
 
 def read_story(log: Path, episode: int | None = None) -> Story:
-    """The last episode of a log, or the one that is asked for. Raises SaccadeError if the log has no frame of it."""
+    """Reads one episode of a log, by default the last one. Raises SaccadeError if the log has no frame of it."""
     story = Story(-1 if episode is None else episode)
     reader = RunReader(log)
     for topic, part, message in reader:
@@ -92,24 +92,26 @@ def read_story(log: Path, episode: int | None = None) -> Story:
 
 
 def _goal_from_elsewhere(reader: RunReader) -> bool:
+    """Whether the user gave the goal image."""
     return recorded(reader.configuration, f"the log {reader.path}").scene.goal_image is not None
 
 
 def draw(log: Path, out: Path, episode: int | None = None) -> Story:
-    """Writes the picture of a logged episode as PNG and returns what it shows."""
+    """Draws an episode of a log as a PNG file, and returns what the picture shows. Raises SaccadeError if the log has
+    no frame of the episode."""
     story = read_story(log, episode)
     draw_story(story, out)
     return story
 
 
 def draw_run(folder: Path) -> Path:
-    """Writes the picture of a run's last episode beside its log; returns where."""
+    """Draws the last episode of a run and writes the picture beside its log. Returns the path of the picture."""
     draw(folder / LOG_NAME, folder / PICTURE_NAME)
     return folder / PICTURE_NAME
 
 
 def draw_story(story: Story, out: Path, *, dpi: int = DPI) -> None:
-    """Writes the picture of an episode as PNG: the goal, the last view, the table from above, the free energy."""
+    """Draws an episode as a PNG file: the goal, the last view, the table from above, and the free energy."""
     figure = new_figure(INCHES, dpi)
     goal, view, above, energy = figure.subplots(1, 4, width_ratios=(1, 1, 1.35, 1))
     image(goal, story.goal_rgb, "goal" if story.goal_rgb is not None else "no goal: exploring")
@@ -121,14 +123,14 @@ def draw_story(story: Story, out: Path, *, dpi: int = DPI) -> None:
 
 
 def new_figure(inches: tuple[float, float], dpi: int = DPI) -> Figure:
-    """A figure that needs no screen."""
+    """Makes a figure that needs no screen."""
     figure = Figure(figsize=inches, dpi=dpi, layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 
 
 def save(figure: Figure, out: Path) -> None:
-    """Writes a figure; the same figure gives the same bytes. Raises SaccadeError where it cannot be written."""
+    """Writes a figure. The same figure gives the same bytes. Raises SaccadeError if the file cannot be written."""
     try:
         figure.savefig(out, metadata={"Software": None})
     except OSError as error:
@@ -136,7 +138,7 @@ def save(figure: Figure, out: Path) -> None:
 
 
 def image(axes: Axes, rgb: NDArray[np.uint8] | None, title: str) -> None:
-    """An image without axes, or the room for one."""
+    """Shows an image without axes. Without an image its place stays empty."""
     axes.set_title(title)
     axes.axis("off")
     if rgb is not None:
@@ -153,13 +155,13 @@ def _from_above(axes: Axes, story: Story) -> None:
             axes.plot(*story.truth.goal_world_from_camera[:2, 3], "*", color="black", markersize=13,
                       label="goal's view", linestyle="none", zorder=4)
     way(axes, np.array(story.path_m))
-    if (reach := 1.05 * float(np.abs(np.array(story.path_m)[:, :2]).max())) > SHOWN_M:  # a real camera's
+    if (reach := 1.05 * float(np.abs(np.array(story.path_m)[:, :2]).max())) > SHOWN_M:  # a real camera may move further
         axes.set(xlim=(-reach, reach), ylim=(-reach, reach))
     axes.legend(loc="center left", bbox_to_anchor=(1.02, 0.5), fontsize=8, frameon=False)
 
 
 def _free_energy(axes: Axes, story: Story) -> None:
-    """F of all objects at each step, by term."""
+    """Plots F of all objects at each step, by term."""
     axes.set(title="free energy of all objects", xlabel="step", ylabel="F (nats)")
     if story.energies:
         steps = sorted(story.energies)
@@ -170,7 +172,7 @@ def _free_energy(axes: Axes, story: Story) -> None:
 
 
 def table_from_above(axes: Axes, title: str) -> None:
-    """The empty table, x to the right and y up."""
+    """Draws the empty table, with x to the right and y up."""
     half = TABLE_SIDE_M / 2
     axes.fill([-half, half, half, -half], [-half, -half, half, half], color="#efeae2", zorder=0)
     axes.set(xlim=(-SHOWN_M, SHOWN_M), ylim=(-SHOWN_M, SHOWN_M), aspect="equal", xlabel="x (m)", ylabel="y (m)",
@@ -178,7 +180,7 @@ def table_from_above(axes: Axes, title: str) -> None:
 
 
 def particles(axes: Axes, beliefs: dict[str, Belief], names: Iterable[str]) -> None:
-    """Where objects are believed to be; each of `names` keeps its colour, whichever of them are drawn."""
+    """Draws where objects are believed to be. Each of `names` has its own colour, whichever of them are drawn."""
     for name, colour in colours(names).items():
         if name in beliefs:
             x_m, y_m = beliefs[name].particles_m[:, :2].T
@@ -187,12 +189,12 @@ def particles(axes: Axes, beliefs: dict[str, Belief], names: Iterable[str]) -> N
 
 
 def colours(names: Iterable[str]) -> dict[str, str]:
-    """A colour for each object."""
+    """Gives each object a colour."""
     return dict(zip(sorted(names), cycle(COLOURS), strict=False))
 
 
 def way(axes: Axes, path_m: NDArray[np.float64]) -> None:
-    """The camera's path [K, 3] and where it is now."""
+    """Draws the camera's path [K, 3] (metres) and its present position."""
     axes.plot(*path_m[:, :2].T, "-", color="#555555", linewidth=1.5, label="camera's path", zorder=1)
     axes.plot(*path_m[-1, :2], "s", color="#555555", markersize=7, zorder=3)
 

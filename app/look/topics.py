@@ -1,4 +1,4 @@
-"""`saccade topics`: what can be on a bus, what is on the one of a run that goes on, what is in a log."""
+"""`saccade topics` lists the topics that exist, those on the bus of a running run, or those in a log."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ LISTEN_S = 2
 
 def topics(*, world: str | None, log: Path | None, on_bus: bool, seconds: int | None, endpoint: str | None,
            run: Path | None, console: Console) -> None:
-    """Shows the registry, or the keys that are in a log, or those on which something comes for some seconds. Raises
-    SaccadeError where nothing can come."""
+    """Prints the topics that exist, the keys in a log, or the keys on which a message comes within some seconds. Raises
+    SaccadeError if options contradict each other, or if no message can come."""
     on_bus = on_bus or any(given is not None for given in (seconds, endpoint, run))
     if log is not None and (on_bus or world is not None):
         raise SaccadeError("--log is for a log, which names its world: leave it or the other options out")
@@ -39,7 +39,7 @@ def topics(*, world: str | None, log: Path | None, on_bus: bool, seconds: int | 
 
 
 def registry(world: str) -> Table:
-    """A row for each topic that there can be."""
+    """Returns a table with a row for each topic that exists."""
     table = Table()
     for header in ("topic", "key", "message", "how often", "what it is"):
         table.add_column(header, no_wrap=header != "what it is")
@@ -52,8 +52,8 @@ def registry(world: str) -> Table:
 
 
 def survey(source: Live, seconds: float) -> Keys:
-    """What comes on a bus for so many seconds, or until Ctrl-C, and what holds for the episode and came before. Nothing
-    waits in a queue here, so nothing is dropped."""
+    """Counts what comes on a bus for so many seconds, or until Ctrl-C. Messages that hold for the episode and came
+    before are counted too. There is no queue here, so nothing is dropped."""
     keys, lock = Keys(), threading.Lock()
 
     def take(topic: Topic, part: str | None, payload: bytes, time_ns: int | None = None) -> None:

@@ -1,4 +1,5 @@
-"""`saccade view`: a run in Rerun's viewer, while it goes on or from its log; or as a file for it."""
+"""`saccade view` shows a run in Rerun's viewer, while it goes on or from its log. It can also write a file for
+Rerun."""
 
 from __future__ import annotations
 
@@ -29,7 +30,7 @@ POLL_S = 0.2
 
 def view_log(path: Path, *, save: Path | None, truth: bool, port: int | None, open_page: bool, weights: Path | None,
              console: Console) -> None:
-    """Shows a log until Ctrl-C, or writes it as a file of Rerun's. Raises SaccadeError for what is no log."""
+    """Shows a log until Ctrl-C, or writes it as a Rerun file to `save`. Raises SaccadeError if `path` is not a log."""
     path = log_of(path)
     log = Log(path, console)
     name = path.resolve().parent.name if path.name == LOG_NAME else path.stem
@@ -51,7 +52,7 @@ def view_log(path: Path, *, save: Path | None, truth: bool, port: int | None, op
 
 def view_live(*, endpoint: str | None, run: Path | None, truth: bool, port: int | None, open_page: bool,
               weights: Path | None, console: Console) -> None:
-    """Shows a run that goes on, from its start, until Ctrl-C. Raises SaccadeError where there is none."""
+    """Shows a running run, from its start, until Ctrl-C. Raises SaccadeError if there is none."""
     config = _with_weights(config_of(endpoint=endpoint, run=run), weights)
     config = _ports(config, port).with_values({"viewer.truth": truth})
     come_last()
@@ -70,7 +71,7 @@ def view_live(*, endpoint: str | None, run: Path | None, truth: bool, port: int 
 
 
 def stay(running: Callable[[], bool]) -> None:
-    """Until Ctrl-C, or what is looked at has ended."""
+    """Waits until Ctrl-C, or until `running()` is false."""
     try:
         while running():
             time.sleep(POLL_S)
@@ -79,7 +80,7 @@ def stay(running: Callable[[], bool]) -> None:
 
 
 def _ports(config: Config, port: int | None) -> Config:
-    """Ports of its own: those of the configuration are taken by the run's viewer."""
+    """Gives the viewer ports of its own, because the run's own viewer uses those of the configuration."""
     own = ViewerConfig()
     config = config.with_values({"viewer.address": own.address, "viewer.port": port or own.port,
                                  "viewer.data_port": own.data_port})
@@ -91,10 +92,10 @@ def _with_weights(config: Config, weights: Path | None) -> Config:
 
 
 def _show(log: Log, recording: rr.RecordingStream, truth: bool, weights: Path | None) -> None:
-    """Every message of a log; says what could not be shown."""
+    """Shows every message of a log, then prints what could not be shown."""
     viewer = None
     for entry, message in log:
-        if viewer is None:  # the configuration stands before the first message
+        if viewer is None:  # a log holds its configuration before the first message
             config = recorded(log.reader.configuration, f"the log {log.reader.path}")
             viewer = Viewer(recording, _with_weights(config, weights), truth=truth, live=False)
         viewer.take(entry.topic, entry.part, message)

@@ -1,4 +1,4 @@
-"""What was said again against what was recorded, field by field, while both come in."""
+"""Compares the messages of a replay with the recorded ones, field by field, while both come in."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from saccade.shared.bus.topics import Topic
 from saccade.shared.bus.wire import decode, stamp_of
 from saccade.shared.log.migrations import ADDED
 
-KEPT = 1_000  # differences that are told one by one
+KEPT = 1_000  # at most so many differences are kept
 
 At = tuple[str, str | None, int, int]  # topic, part, episode, step
 
 
 @dataclass(frozen=True)
 class Difference:
-    """One field of one message that is not as recorded. `size`: the largest |replayed - recorded| of its numbers; of
-    packed bits, the share of them that differs."""
+    """One field of one message that differs from the recording. `size` is the largest |replayed - recorded| of its
+    numbers. For packed bits it is the share of bits that differ. It is infinite where there is no such number."""
 
     topic: str
     part: str | None
@@ -42,38 +42,41 @@ class Difference:
 
 @dataclass
 class Comparison:
-    """Takes messages of the recording and of the replay in any order, each pair is compared when it is whole. Memory:
-    what one of the two is ahead of the other."""
+    """Takes messages of the recording and of the replay in any order. A pair is compared when both messages are there.
+    Only messages that still wait for the other one are kept in memory."""
 
     compared: int = 0
-    unequal: int = 0  # messages that differ in a byte
-    beyond: int = 0  # of those, beyond what is tolerated
+    unequal: int = 0  # pairs that differ in a byte
+    beyond: int = 0  # pairs that differ beyond what is tolerated
     differences: list[Difference] = field(default_factory=list)
-    on_pair: Callable[[Topic, str | None, Message, Message], None] | None = None  # sees every recorded and replayed
+    # Called with topic, part, recorded and replayed message of every pair
+    on_pair: Callable[[Topic, str | None, Message, Message], None] | None = None
     _recorded: dict[At, tuple[Topic, bytes]] = field(default_factory=dict)
     _replayed: dict[At, tuple[Topic, bytes]] = field(default_factory=dict)
 
     def recorded(self, topic: Topic, part: str | None, payload: bytes) -> list[Difference]:
-        """The wire bytes of a message of the recording; the differences, if its twin is there."""
+        """Takes the wire bytes of a recorded message. Returns the differences if the replayed one is there, else
+        none."""
         return self._take(self._recorded, self._replayed, topic, part, payload)
 
     def replayed(self, topic: Topic, part: str | None, payload: bytes) -> list[Difference]:
-        """The wire bytes of a message of the replay; the differences, if its twin is there."""
+        """Takes the wire bytes of a replayed message. Returns the differences if the recorded one is there, else
+        none."""
         return self._take(self._replayed, self._recorded, topic, part, payload)
 
     @property
     def equal(self) -> bool:
-        """Nothing differs beyond what is tolerated, and nothing is there on one side alone."""
+        """Whether nothing differs beyond what is tolerated, and no message is on one side alone."""
         return not (self.beyond or self._recorded or self._replayed)
 
     @property
     def only_recorded(self) -> list[At]:
-        """What the replay did not say."""
+        """The messages that the replay did not produce."""
         return sorted(self._recorded, key=str)
 
     @property
     def only_replayed(self) -> list[At]:
-        """What the recording does not have."""
+        """The messages that the recording does not have."""
         return sorted(self._replayed, key=str)
 
     def _take(self, own: dict, other: dict, topic: Topic, part: str | None, payload: bytes) -> list[Difference]:
@@ -100,7 +103,7 @@ class Comparison:
 
 
 def differences(topic: Topic, part: str | None, recorded: Message, replayed: Message) -> Iterator[Difference]:
-    """The fields in which two messages differ, whatever is tolerated."""
+    """Yields the fields in which two messages differ, tolerated or not."""
     for entry in dataclasses.fields(recorded):
         old, new = getattr(recorded, entry.name), getattr(replayed, entry.name)
         if entry.name in IGNORED or np.array_equal(old, new):
@@ -113,7 +116,7 @@ def differences(topic: Topic, part: str | None, recorded: Message, replayed: Mes
 
 
 def _size(topic: str, name: str, old: Any, new: Any) -> tuple[float, bool]:
-    """How far two values are apart, and whether that is tolerated."""
+    """Returns how far two values are apart, and whether that is tolerated."""
     if any(isinstance(v, (str, bool, list, type(None))) for v in (old, new)) or np.shape(old) != np.shape(new):
         return float("inf"), False
     allowed = tolerance_of(topic, name)
@@ -126,7 +129,7 @@ def _size(topic: str, name: str, old: Any, new: Any) -> tuple[float, bool]:
 
 
 def _texts(old: Any, new: Any) -> tuple[str, str]:
-    """Both values; of arrays the numbers that are furthest apart, with their place."""
+    """Returns both values as text. For arrays these are the numbers that are furthest apart, with their index."""
     if not (isinstance(old, np.ndarray) and isinstance(new, np.ndarray)):
         return _text(old), _text(new)
     if old.shape != new.shape:

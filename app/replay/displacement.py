@@ -1,4 +1,5 @@
-"""How far percepts, beliefs and actions moved when a service was swapped: the same inputs, other words."""
+"""Measures how far percepts, beliefs, plans and actions moved when a service was swapped: the inputs are the same, the
+answers differ."""
 
 from __future__ import annotations
 
@@ -48,13 +49,13 @@ def _goal_view(old: Belief, new: Belief) -> float | None:
 
 
 def _peak(log_posterior: NDArray[np.float32]) -> NDArray[np.float64]:
-    """The likeliest viewing direction as a unit vector."""
+    """The most likely viewing direction, as a unit vector [3]."""
     (elevations, azimuths), (e, a) = viewing_grid(), np.unravel_index(np.argmax(log_posterior), log_posterior.shape)
     elevation, azimuth = elevations[e], azimuths[a]
     return np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
 
 
-# By topic: what is measured, with its unit. None where one of the two has nothing to measure.
+# What is measured, by topic, with its unit. A value is None if one of the two messages has nothing to measure.
 MEASURES: dict[str, dict[str, Callable[[Any, Any], float | None]]] = {
     "percept": {"presence": lambda old, new: abs(new.presence - old.presence), "pixel (px)": _pixel,
                 "log scale": _log_scale},
@@ -68,21 +69,21 @@ MEASURES: dict[str, dict[str, Callable[[Any, Any], float | None]]] = {
 
 
 class Moved:
-    """Collects the measures of pairs of messages, recorded and replayed."""
+    """Collects the measures over pairs of a recorded and a replayed message."""
 
     def __init__(self) -> None:
         self._found: dict[tuple[str, str], dict[str | None, list[tuple[int, int, float]]]] = defaultdict(
             lambda: defaultdict(list))
 
     def take(self, topic: Topic, part: str | None, recorded: Message, replayed: Message) -> None:
-        """One pair."""
+        """Measures one pair."""
         for name, measure in MEASURES.get(topic.name, {}).items():
             value = measure(recorded, replayed)
             if value is not None:
                 self._found[topic.name, name][part].append((recorded.episode, recorded.step, value))
 
     def table(self) -> Table:
-        """Median, 90th percentile and largest of every measure, per object."""
+        """Returns a table with the median, the 90th percentile and the maximum of every measure, for each object."""
         table = Table("topic", "what", "of", "pairs", "median", "90 %", "largest")
         for (topic, name), parts in self._found.items():
             for part, values in sorted(parts.items(), key=str):
@@ -93,7 +94,7 @@ class Moved:
         return table
 
     def draw(self, path: Path) -> None:
-        """Every measure over the steps, one line per object; episodes one after the other."""
+        """Plots every measure over the steps, with a line for each object. Episodes follow one another."""
         figure = Figure(figsize=(11, 1.7 * max(1, len(self._found)) + 0.6), layout="constrained")
         axes = np.atleast_1d(figure.subplots(max(1, len(self._found)), 1, sharex=True))
         steps = sorted({(e, s) for parts in self._found.values() for v in parts.values() for e, s, _ in v})

@@ -1,5 +1,5 @@
-"""`saccade replay`: recorded inputs into services as they are now. What they say is logged, and compared with what was
-recorded."""
+"""`saccade replay` plays recorded inputs into the present services, logs what they say, and compares it with the
+recording."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ from saccade.shared.loop.service import Service
 from saccade.shared.loop.stepper import Stepper, settle
 
 REPLAYABLE = ("perception", "belief", "planner", "evaluator")
-WINDOW = 32  # steps that the log may be ahead of the slowest service
-HALTED_S = 30.0  # without any output although there are inputs
+WINDOW = 32  # the player may be so many steps ahead of the slowest service
+HALTED_S = 30.0  # after so long without output, although there are inputs, a replay is given up
 
 OnMoved = Callable[[Topic, str | None, Message, Message], None]
 
 
 @dataclass(frozen=True)
 class Replay:
-    """What is to be played into what. `config` is the recorded one, with what was changed by the user. `live`: it was
-    recorded live, so that not every step was taken by all."""
+    """What is played into which services. `config` is the recorded configuration with the user's changes. `live` says
+    that the run was recorded live, so that not every service took every step."""
 
     log: Path
     into: tuple[str, ...]
@@ -55,13 +55,14 @@ class Replay:
 
     @property
     def services(self) -> list[Service]:
-        """Their declarations."""
+        """The declarations of the services."""
         return [service_of(name, self.config) for name in self.into]
 
 
 @dataclass
 class Outcome:
-    """What came of it. `played`: messages put in, by topic; `statuses`: what each process counted (on the bus)."""
+    """The result of a replay. `played` counts the messages that were put in, by topic. `statuses` is what each process
+    counted (on the bus only). `late_s` is how far the player was behind its pace."""
 
     log: Path
     comparison: Comparison = field(default_factory=Comparison)
@@ -73,8 +74,8 @@ class Outcome:
 def prepare(log: Path, into: Sequence[str], values: dict, *, pace: Pace, topics: Sequence[Topic] | None = None,
             episode: int | None = None, start_step: int = 0, end_step: int | None = None,
             one_by_one: bool = False) -> Replay:
-    """Reads the log's configuration. Raises SaccadeError for a service that cannot be played to, and for a log that has
-    none."""
+    """Reads the log's configuration and prepares a replay. Raises SaccadeError if one of the services cannot be
+    replayed, or if the log has no messages or no configuration."""
     strange = [name for name in into if name not in REPLAYABLE]
     if strange:
         raise SaccadeError(f"--into {strange[0]}: choose from {', '.join(REPLAYABLE)}; the log stands for the rest")
@@ -96,7 +97,7 @@ def prepare(log: Path, into: Sequence[str], values: dict, *, pace: Pace, topics:
 
 
 def recorded_config(log: Path) -> tuple[Config, str, int]:
-    """(configuration, run's name, first step) of a log. Raises SaccadeError where it has none."""
+    """Returns (configuration, name of the run, first step) of a log. Raises SaccadeError if it has none."""
     reader = RunReader(log)
     first = next((told for told in reader if told[0].in_step), None)
     if first is None or reader.configuration is None:
@@ -107,8 +108,8 @@ def recorded_config(log: Path) -> tuple[Config, str, int]:
 
 def replay_here(replay: Replay, out: Path, keys: Keys, say: Callable[[str], None],
                 on_moved: OnMoved | None = None) -> Outcome:
-    """Within this process: the services' cores, step by step, as on the bus to the byte. Of a log that was recorded
-    live each service takes the steps that it took then."""
+    """Replays within this process, step by step; the bytes are the same as on the bus. If the log was recorded live,
+    each service takes the steps that it took then."""
     config, outcome = replay.config, Outcome(out / LOG_NAME)
     steppers = [Stepper(service, core, config.names, live=replay.live, first_step=config.bus.first_step)
                 for service, core in pairs_of(replay.into, config)]
@@ -128,7 +129,7 @@ def replay_here(replay: Replay, out: Path, keys: Keys, say: Callable[[str], None
             while waiting:
                 output = waiting.popleft()
                 for stepper in (s for s in steppers if _is_input(output, s.service, taken)):
-                    with suppress(MessageError):  # counted where it is recorded: a stranger's
+                    with suppress(MessageError):  # of a sender outside this run; the recorded run has counted it
                         stepper.offer(output.topic, output.part, settle(output.message))
                     while (made := stepper.advance()) is not None:
                         for each in made:
@@ -141,7 +142,7 @@ def replay_here(replay: Replay, out: Path, keys: Keys, say: Callable[[str], None
 
 
 def steps_taken(replay: Replay) -> dict[str, set[tuple[int, int]]]:
-    """Of each service the (episode, step) pairs that it answered in the recording."""
+    """Returns, for each service, the (episode, step) pairs that it answered in the recording."""
     taken: dict[str, set[tuple[int, int]]] = {name: set() for name in replay.into}
     makers = {topic.name: service.name for service in replay.services for topic in service.outputs}
     for entry in RunReader(replay.log).entries():
@@ -160,7 +161,7 @@ def _is_input(output: Output, service: Service, taken: dict[str, set[tuple[int, 
 
 
 def new_log(out: Path, config: Config) -> RunLog:
-    """The log of a replay, in a new folder with the configuration beside it."""
+    """Opens the log of a replay in a new folder, and saves the configuration beside it."""
     out.mkdir(parents=True, exist_ok=True)
     log = RunLog(out / LOG_NAME, world=config.bus.world, configuration=config.model_dump_json(indent=2),
                  metadata=describe(config, config.run or out.name))
@@ -170,7 +171,7 @@ def new_log(out: Path, config: Config) -> RunLog:
 
 def played(replay: Replay, keys: Keys, say: Callable[[str], None], outcome: Outcome, twins: Twins,
            may_go_on: Callable[[Stamp], bool] = lambda _stamp: True) -> Iterator[tuple[Recorded, Stamp]]:
-    """The inputs when they are due; what the services said in the recording goes to the comparison as it is passed."""
+    """Yields the inputs when they are due. What the services said in the recording goes to the comparison."""
 
     def inputs() -> Iterator[Recorded]:
         for entry in RunReader(replay.log, sums=False).entries():
@@ -186,28 +187,28 @@ def played(replay: Replay, keys: Keys, say: Callable[[str], None], outcome: Outc
 
 
 class Twins:
-    """Feeds a comparison; `on_moved(topic, part, recorded, replayed)` sees every pair. Safe between threads."""
+    """Feeds a comparison. Calls `on_moved(topic, part, recorded, replayed)` for every pair. Safe between threads."""
 
     def __init__(self, comparison: Comparison, on_moved: OnMoved | None = None) -> None:
         self._comparison, self._lock = comparison, threading.Lock()
         comparison.on_pair = on_moved
 
     def recorded(self, entry: Recorded, wanted: Selection) -> None:
-        """An entry of the old log."""
+        """Takes an entry of the recording."""
         with suppress(MessageError), self._lock:
             if (entry.topic, stamp_of(entry.payload)) in wanted:
                 self._comparison.recorded(entry.topic, entry.part, entry.payload)
 
     def replayed(self, topic: Topic, part: str | None, payload: bytes) -> None:
-        """What was said now."""
+        """Takes a message of the replay."""
         with self._lock:
             self._comparison.replayed(topic, part, payload)
 
 
 def replay_on_bus(replay: Replay, out: Path, keys: Keys, say: Callable[[str], None],
                   on_moved: OnMoved | None = None) -> Outcome:
-    """On a bus of its own, one process per service, recorded by the recorder. Raises SaccadeError for a log that was
-    recorded live: which steps a process takes then is a matter of time."""
+    """Replays on a new bus, with one process per service and the recorder. Raises SaccadeError if the log was recorded
+    live, because the steps that a process takes then depend on time."""
     if replay.live:
         raise SaccadeError(f"log {replay.log} was recorded live: add --bus local, which takes the same steps")
     config = replay.config.with_values({"bus.endpoint": free_endpoint(replay.config.bus.endpoint)})
@@ -223,13 +224,13 @@ def replay_on_bus(replay: Replay, out: Path, keys: Keys, say: Callable[[str], No
 
 
 class _Playing:
-    """The log on one thread, its services' answers on another, and how far apart the two may be."""
+    """Plays the log on one thread, takes the answers on another, and limits how far the first may be ahead."""
 
     def __init__(self, replay: Replay, graph: Graph, outcome: Outcome, on_moved: OnMoved | None) -> None:
         self._replay, self._graph, self.outcome = replay, graph, outcome
         self._twins, self._outbox = Twins(outcome.comparison, on_moved), Outbox()
         self._steps: dict[str, set[tuple[int, int]]] = {t.name: set() for t in replay.selection.topics}
-        self._reached: dict[str, dict[tuple[str, str | None], int]] = {}  # by what started it: answers of each key
+        self._reached: dict[str, dict[tuple[str, str | None], int]] = {}  # by played topic: answers on each key
         self._error: BaseException | None = None
         for service in replay.services:
             for topic in (topic for topic in service.outputs if not topic.latched):
@@ -237,7 +238,7 @@ class _Playing:
                 self._reached.setdefault(self._cause(service).name, {}).update({(topic.name, p): 0 for p in parts})
 
     def run(self, keys: Keys, say: Callable[[str], None]) -> Outcome:
-        """Plays the log once the services are ready; returns when all that was played has been answered."""
+        """Plays the log when the services are ready, until all is answered. Raises SaccadeError if no answer comes."""
         self._graph.bus.answer(self._replay.selection.topics, self._outbox.answer)
         thread = threading.Thread(target=self._play, args=(keys, say), name="player", daemon=True)
         waiting = {*self._replay.into, "recorder"}
@@ -259,12 +260,12 @@ class _Playing:
         return self.outcome
 
     def drain(self) -> None:
-        """What the processes say last."""
+        """Takes the last messages of the processes."""
         while (item := next(self._graph.messages)) is not None:
             self._take(*item)
 
     def _take(self, topic: Topic, part: str | None, message: Message) -> bool:
-        """Notes a message; whether it was an answer."""
+        """Takes a message. Returns whether it was an answer."""
         if isinstance(message, Status) and part is not None:
             self.outcome.statuses[part] = message
             return False
@@ -277,12 +278,13 @@ class _Playing:
         return True
 
     def _cause(self, service: Service) -> Topic:
-        """The played topic that makes a service step: its trigger, or that of whoever makes its trigger."""
+        """The played topic that makes a service step: its trigger, or the cause of the service that publishes the
+        trigger."""
         makers = [other for other in self._replay.services if service.trigger in other.outputs]
         return self._cause(makers[0]) if makers else service.trigger
 
     def _behind(self) -> int:
-        """Steps that were played and not answered by all."""
+        """How many steps were played and are not yet answered by all services."""
         return max((len(self._steps.get(cause, ())) - min(answers.values())
                     for cause, answers in self._reached.items()), default=0)
 

@@ -1,4 +1,4 @@
-"""What replays tell: differences, losses, and how far things moved."""
+"""Prints what replays found: differences, losses, and how far messages moved."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from saccade.shared.config import weights_folder
 from saccade.shared.errors import SaccadeError
 from saccade.shared.log.folder import LOG_NAME
 
-TOLD = 10  # differences that are printed
+TOLD = 10  # at most so many differences are printed
 PICTURE_NAME, TABLE_NAME = "moved.png", "moved.txt"
 
 
 def replays_of(logs: Sequence[Path], *, into: str, rate: str, start: str | None, end: str | None,
                episode: int | None, topics: str | None, step: bool, perception: Path | None,
                values: dict[str, Any]) -> list[Replay]:
-    """What the command line asks for. Raises SaccadeError for what makes no sense."""
+    """Makes the replays that the command line asks for. Raises SaccadeError if an option makes no sense."""
     names = [name.strip() for name in into.split(",") if name.strip()]
     chosen = None if topics is None else [_topic(name.strip()) for name in topics.split(",")]
     swap = _weights(perception) | values
@@ -56,7 +56,8 @@ def _rate(text: str) -> float | None:
 
 
 def _range(log: Path, episode: int | None, start: str | None, end: str | None) -> tuple[int | None, int, int | None]:
-    """(episode, first step, last step): the two ends in steps, or both in seconds from the start of the log."""
+    """Returns (episode, first step, last step). The two ends are steps, or both are seconds from the start of the
+    log."""
     ends = [text for text in (start, end) if text is not None]
     try:
         if ends and all(text.endswith("s") for text in ends):
@@ -75,7 +76,7 @@ def _topic(name: str) -> Topic:
 
 
 def _weights(perception: Path | None) -> dict[str, str]:
-    """The configuration of other perception weights: a folder, or the name of one in weights/."""
+    """Returns the keys of the configuration for other perception weights: a folder, or the name of one in weights/."""
     folder = weights_folder(perception)
     if folder is None:
         return {}
@@ -88,8 +89,9 @@ def _weights(perception: Path | None) -> dict[str, str]:
 
 def replay_all(replays: Sequence[Replay], *, bus: str, out: Path | None, swapped: bool, loops: int,
                console: Console) -> bool:
-    """Plays the logs, side by side on buses of their own or one after the other in this process, into new folders;
-    prints what came of it. Whether every replay said what was recorded."""
+    """Plays the logs into new folders and prints the results. On the bus they run side by side, each on a bus of its
+    own; within this process they run one after the other. Returns whether every replay agrees with its recording.
+    Raises SaccadeError if the folder is not new."""
     folder = out or Path("replays") / time.strftime("%Y%m%d-%H%M%S")
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise SaccadeError(f"{folder} is there already: a replay needs a new folder, give another --out")
@@ -121,7 +123,7 @@ def _pass(replays: Sequence[Replay], bus: str, folder: Path, swapped: bool, cons
 
 
 def tell(replay: Replay, outcome: Outcome, console: Console) -> None:
-    """One replay in a few lines."""
+    """Prints the result of one replay in a few lines."""
     comparison, note = outcome.comparison, partial(say, console)
     count = sum(outcome.played.values())
     note(f"{replay.log}: {count} messages played into {', '.join(replay.into)}; {comparison.compared} answers "

@@ -1,4 +1,5 @@
-"""An agent within this process, for a robot or a simulator of one's own: images and poses in, actions out, no bus."""
+"""An agent within this process, for your own robot or simulator: images and poses go in, actions come out. There is no
+bus."""
 
 from __future__ import annotations
 
@@ -22,15 +23,16 @@ from saccade.shared.world.images import read_image
 
 Image = NDArray[np.uint8]
 RUN = "agent"
-ORTHONORMAL = 1e-3  # how far a rotation's columns may be from unit vectors at right angles
+ORTHONORMAL = 1e-3  # how far the columns of a rotation may be from orthonormal
 
 
 class Agent:
-    """Perception, belief and planner of a configuration, stepped by whoever owns the camera.
+    """Perception, belief and planner of a configuration, stepped by the program that owns the camera.
 
-    `goal`: the image to reach, a file or an array [H, W, 3] of bytes; without one the agent explores. `intrinsics`:
-    (fx, fy, cx, cy) of your images in pixels; without them images of 480x480 pixels are taken as the training's
-    camera's, and of others the central square. Raises SaccadeError for a configuration or a goal that cannot be used.
+    `goal` is the image to reach: a file, or an array [H, W, 3] of uint8. Without a goal the agent explores.
+    `intrinsics` are (fx, fy, cx, cy) of your images, in pixels. Without them, an image of 480x480 pixels is taken as an
+    image of the training's camera, and of any other image the central square is used. Raises SaccadeError if the
+    configuration or the goal cannot be used.
     """
 
     def __init__(self, config: Config, *, agent: str = "sceneccn", goal: str | Path | ArrayLike | None = None,
@@ -43,7 +45,8 @@ class Agent:
         self.reset(goal)
 
     def reset(self, goal: str | Path | ArrayLike | None = None) -> None:
-        """A new scene, about which nothing is known yet, and a new goal image."""
+        """Begins a new scene, about which nothing is known yet. `goal` is the new goal image: a file, or an array
+        [H, W, 3] of uint8. Without a goal the agent explores. Raises SaccadeError if the goal cannot be used."""
         if (goal is None) != self.config.scene.explore:
             self.config = self.config.with_values({"scene.explore": goal is None})
             self._pairs = agent_pairs(self._agent, self.config)
@@ -59,11 +62,11 @@ class Agent:
 
     def step(self, rgb: ArrayLike, world_from_camera: ArrayLike,
              intrinsics: Sequence[float] | None = None) -> Action:
-        """The next move, from an image [H, W, 3] of bytes and the camera's pose [4, 4] (metres; OpenGL: the camera
-        looks along its -z, +y is up).
+        """Returns the next move for an image [H, W, 3] of uint8 and the camera's pose [4, 4]. The pose is in metres and
+        follows OpenGL: the camera looks along its -z axis, and its +y axis is up.
 
-        `intrinsics`: of this image, where they are not those of all images. Raises SaccadeError for an image or a pose
-        that is none.
+        `intrinsics` are those of this image, if they differ from those of the other images. Raises SaccadeError if the
+        image or the pose is not valid, or if the agent does not answer.
         """
         image = self._as_trained(image_of(rgb, "image"), intrinsics)
         frame = Frame(run=RUN, episode=self._episode, step=self._step, seq=self._step, rgb=image,
@@ -88,7 +91,7 @@ class Agent:
                 kept[topic][part] = message
 
     def _as_trained(self, rgb: Image, intrinsics: Sequence[float] | None = None) -> Image:
-        """The image as the camera of the training would have seen it from the same pose."""
+        """Returns the image [480, 480, 3] that the training's camera would have seen from the same pose."""
         intrinsics = self.intrinsics if intrinsics is None else intrinsics
         if intrinsics is None and rgb.shape == (IMAGE_SIZE_PX, IMAGE_SIZE_PX, 3):
             return rgb
@@ -96,6 +99,8 @@ class Agent:
 
 
 def image_of(given: str | Path | ArrayLike, what: str) -> Image:
+    """Reads an image file, or checks an array [H, W, 3] of uint8. Raises SaccadeError, which begins with `what`, if it
+    is no such image."""
     if isinstance(given, (str, Path)):
         return read_image(Path(given), what=what)
     rgb = np.asarray(given)
@@ -105,6 +110,8 @@ def image_of(given: str | Path | ArrayLike, what: str) -> Image:
 
 
 def _pose(given: ArrayLike) -> NDArray[np.float64]:
+    """Checks a pose [4, 4]. Raises SaccadeError if it is not finite, or if its upper left 3x3 numbers are not a
+    rotation."""
     pose = np.array(given, dtype=np.float64)
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
         raise SaccadeError(f"world_from_camera of shape {list(pose.shape)}: give 4x4 finite numbers")

@@ -1,4 +1,4 @@
-"""What a run looks like while it goes on: a live display on a terminal, or a line now and then."""
+"""Shows a run while it goes on: as a live display on a terminal, or as a line from time to time."""
 
 from __future__ import annotations
 
@@ -15,18 +15,19 @@ from saccade.shared.bus.topics import BELIEF, FRAME, PLAN, RESULT, STATUS, TRUTH
 from saccade.shared.loop.main import WAITS
 from saccade.shared.loop.process import REFUSED
 
-LINE_EVERY = 10  # steps, in plain mode
+LINE_EVERY = 10  # in plain mode, a line is printed every so many steps
 PER_SECOND = 8
 
 
 def say(console: Console, text: str) -> None:
-    """A line as it is: neither wrapped nor coloured."""
+    """Prints a line as it is, without wrapping and without colours."""
     console.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
 class Progress:
-    """What the messages of a run have told so far. `judged`: the truth knows the goal's view, so distances tell. `at`:
-    episode and step of the newest view; `declared`: the plan by which the agent first said that it is there."""
+    """What the messages of a run have told so far. `judged` says that the truth knows the goal's view, so that true
+    distances can be shown. `at` is the episode and step of the newest view. `declared` is the first plan that says that
+    the agent has arrived."""
 
     def __init__(self, *, judged: bool = True) -> None:
         self.judged = judged
@@ -39,7 +40,7 @@ class Progress:
         self.results: list[Result] = []
 
     def take(self, topic: Topic, part: str | None, message: Message) -> None:
-        """Any message; those of an earlier episode are forgotten."""
+        """Takes any message. Plans and beliefs of an earlier episode are forgotten."""
         if topic in (FRAME, TRUTH):
             if self.at is not None and message.episode != self.at[0]:
                 self.plan, self.declared, self.beliefs = None, None, {}
@@ -58,26 +59,26 @@ class Progress:
 
     @property
     def distance_m(self) -> float | None:
-        """From the camera to the goal's camera, in truth; None where nobody knows."""
+        """The true distance from the camera to the goal's camera. It is None if nobody knows it."""
         if self.truth is None or not self.judged:
             return None
         return float(np.linalg.norm((self.truth.world_from_camera - self.truth.goal_world_from_camera)[:3, 3]))
 
     @property
     def believed_distance_m(self) -> float | None:
-        """The same as the agent believes; None while it has no idea."""
+        """The same distance as the agent believes it. It is None while the agent has no such belief."""
         if self.plan is None or self.plan.believed_distance_m < 0:
             return None
         return self.plan.believed_distance_m
 
 
 def spread_cm(belief: Belief) -> float:
-    """Standard deviation of a believed position, over all axes."""
+    """Standard deviation of a believed position over all axes, in centimetres."""
     return 100 * float(np.sqrt(max(np.trace(belief.covariance_m2), 0.0)))
 
 
 def line(progress: Progress) -> str:
-    """The state of a run in one line."""
+    """Returns the state of a run as one line."""
     plan = progress.plan
     if progress.at is None:
         return "starting"
@@ -95,7 +96,7 @@ def line(progress: Progress) -> str:
 
 
 def panel(progress: Progress) -> RenderableType:
-    """The state of a run for the live display."""
+    """Returns the state of a run for the live display."""
     if progress.at is None:
         waiting = sorted(f"{name} {status.state}" for name, status in progress.statuses.items())
         return Text("starting: " + ", ".join(waiting or ["services"]))
@@ -143,8 +144,9 @@ def _metres(distance_m: float | None) -> str:
 
 
 class Display:
-    """Shows a run's messages on a console; a context manager. Plain where asked for and where nobody sits before it.
-    `camera`: the name of the source if it is a real camera, which knows no truth and has notes for the user."""
+    """Shows the messages of a run on a console; it is a context manager. Its output is plain if that is asked for, or
+    if the console is not a terminal. `camera` is the name of the source if it is a real camera. Such a source knows no
+    truth, and has notes for the user."""
 
     def __init__(self, console: Console, *, plain: bool, judged: bool = True, camera: str | None = None) -> None:
         self.progress, self.console = Progress(judged=judged), console
@@ -166,7 +168,7 @@ class Display:
 
     @property
     def topics(self) -> tuple[Topic, ...]:
-        """What is shown: all but images and percepts."""
+        """The topics that the display needs."""
         return (self._view, PLAN, BELIEF, STATUS, RESULT)
 
     @property
@@ -174,11 +176,11 @@ class Display:
         return FRAME if self._camera else TRUTH
 
     def say(self, text: str) -> None:
-        """A line that stays: what befell a service, what a camera assumes."""
+        """Prints a line that stays, such as what happened to a service, or what a camera assumes."""
         say(self.console, text)
 
     def take(self, topic: Topic, part: str | None, message: Message) -> None:
-        """To be called with every message of these topics."""
+        """Takes a message. It must be called with every message of `topics`."""
         self.progress.take(topic, part, message)
         if isinstance(message, Status) and part == self._camera:
             self.note(message.note)
@@ -186,7 +188,7 @@ class Display:
             say(self.console, line(self.progress))
 
     def note(self, text: str) -> None:
-        """Says the lines of a camera's notes that are new."""
+        """Prints those lines of a camera's notes that are new."""
         for line in text.splitlines():
             if line not in self._told and not line.startswith((WAITS, REFUSED)):
                 self._told.add(line)

@@ -1,4 +1,4 @@
-"""A whole agent on this machine: the bus, one process per service, and their end."""
+"""Starts a whole agent on this machine: the bus and one process for each service. It ends them when the run is over."""
 
 from __future__ import annotations
 
@@ -28,14 +28,15 @@ from saccade.shared.loop.process import Item
 
 Told = tuple[Topic, str | None, Message]
 OnMessage = Callable[[Topic, str | None, Message], None]
-FOLLOWED = (STATUS, PLAN, RESULT)  # by which the launcher knows how far a run is
-READY_S = 120.0  # loading weights on a busy machine takes its time
+FOLLOWED = (STATUS, PLAN, RESULT)  # these topics tell the launcher how far a run is
+READY_S = 120.0  # on a busy machine it takes long to load weights
 POLL_S = 0.2
-QUIET_S = 2.0  # without news a result is asked for: it may have been published while the router was away
-WORKED_OFF_S = 10.0  # without news after the last frame, where nobody judges: its plan will not come any more
+# After so long without news the launcher asks for results: one may have been published while the router was away.
+QUIET_S = 2.0
+WORKED_OFF_S = 10.0  # If nobody judges: after so long without news the plan for the last frame will not come any more.
 JUDGE = "evaluator"
 
-# The router, then the others in the order of the data.
+# The router, then the others in the order in which the data passes them.
 ROUTER, *SERVICES = PROCESSES = tuple(Process(name, f"saccade.services.{name}") for name in (
     "router", "simulator", "perception", "belief", "planner", JUDGE, "recorder"))
 
@@ -43,14 +44,15 @@ ROUTER, *SERVICES = PROCESSES = tuple(Process(name, f"saccade.services.{name}") 
 def launch(config: Config, run_dir: Path, on_message: OnMessage | None = None,
            processes: Sequence[Process] = PROCESSES, say: Callable[[str], None] | None = None,
            topics: Sequence[Topic] | None = None) -> list[Result]:
-    """`launched` without a look at what stays when the run is over."""
+    """Runs all episodes like `launched`, stops the onlookers too when the run is over, and returns the results."""
     with launched(config, run_dir, on_message, processes, say, topics) as ended:
         return ended.results
 
 
 @dataclass(frozen=True)
 class Ended:
-    """A run that is over: its results, and whether a process that looks on is still there."""
+    """A run that is over: its results, and `runs(name)`, which says whether the process of an onlooker is still
+    there."""
 
     results: list[Result]
     runs: Callable[[str], bool]
@@ -60,14 +62,15 @@ class Ended:
 def launched(config: Config, run_dir: Path, on_message: OnMessage | None = None,
              processes: Sequence[Process] = PROCESSES, say: Callable[[str], None] | None = None,
              topics: Sequence[Topic] | None = None) -> Iterator[Ended]:
-    """Runs all episodes, one process per service, and gives their results in order, none where nobody judges; the log
-    is `run_dir`/run.mcap. A run ends when its source has finished and what it sent has been worked off. Who looks on
-    stays until the context is left.
+    """Runs all episodes, with one process for each service. Yields their results in order; there are none if nobody
+    judges. The log is `run_dir`/run.mcap. A run ends when its source has finished and everything that the source sent
+    has been worked off. Onlookers stay until the context is left.
 
-    `on_message(topic, part, message)` sees every valid message once, on the caller's thread, of these topics or of all:
-    what nobody looks at costs nothing. `say(text)` is told of services that died and were started again, and of
-    those that hang. The first process is the router, the second the source. Raises SaccadeError, naming the service, if
-    one says why it cannot run, dies too often or is not ready within READY_S.
+    `on_message(topic, part, message)` sees every valid message of these topics once, on the caller's thread; without
+    `topics` it sees all. Topics that nobody wants cost nothing. `say(text)` is told of services that died and were
+    started again, and of those that hang. The first process is the router, the second is the source. Raises
+    SaccadeError, which names the service, if a service says why it cannot run, dies too often, or is not ready within
+    READY_S.
     """
     config = resolve(config, processes)
     wanted = topics if on_message else ()
@@ -75,30 +78,31 @@ def launched(config: Config, run_dir: Path, on_message: OnMessage | None = None,
         results = follow(graph.messages, graph.supervisor, processes, on_message)
         graph.supervisor.stop(onlookers=False)
         _drain(graph.messages, on_message)
-        for complaint in graph.supervisor.complaints():  # what went wrong beside the results, such as a full disk
+        for complaint in graph.supervisor.complaints():  # such as a full disk
             print(f"saccade: {complaint}", file=sys.stderr)
         yield Ended(results, graph.supervisor.runs)
 
 
 class Watch(Protocol):
-    """Who knows how the services of a run are: their supervisor, or one that only hears them."""
+    """What knows the state of the services of a run: their supervisor, or an object that only hears their
+    heartbeats."""
 
     stopped: bool
 
     def heard(self, name: str, state: str) -> None:
-        """A heartbeat has come."""
+        """Takes a heartbeat."""
 
     def check(self) -> None:
-        """To be called a few times a second."""
+        """It must be called a few times a second."""
 
     def settled(self, since_s: float) -> bool:
-        """Whether all services were heard since that time."""
+        """Whether all services were heard since that time (monotonic clock, seconds)."""
 
 
 @dataclass(frozen=True)
 class Graph:
-    """Processes that run, and a place on their bus. `messages`: (topic, part, message) as they arrive, each once, and
-    None when nothing did; iterating watches over the processes."""
+    """Processes that run, and a client on their bus. `messages` yields (topic, part, message) as they arrive, each
+    once, and None when nothing arrived. While it is iterated, the processes are watched."""
 
     bus: Bus
     supervisor: Supervisor
@@ -108,8 +112,9 @@ class Graph:
 @contextmanager
 def running(config: Config, run_dir: Path, processes: Sequence[Process], topics: Iterable[Topic] | None,
             say: Callable[[str], None] | None = None) -> Iterator[Graph]:
-    """The processes of a resolved configuration in a new run folder, ended when the context is left. The first is the
-    router, and is there before the others. `topics`: which messages are wanted, None for all."""
+    """Starts the processes of a resolved configuration in a new run folder, and ends them when the context is left. The
+    first one is the router; it is ready before the others start. `topics` are the wanted topics, None for all. Raises
+    SaccadeError if the folder cannot be used, or if a process cannot run."""
     _prepare(run_dir)
     config.save(run_dir / CONFIG_NAME)
     arrived: queue.SimpleQueue[Item] = queue.SimpleQueue()
@@ -129,7 +134,8 @@ def running(config: Config, run_dir: Path, processes: Sequence[Process], topics:
 
 
 def resolve(config: Config, processes: Sequence[Process] = PROCESSES) -> Config:
-    """The configuration as the processes read it: objects named, a free port, who must be ready first."""
+    """Returns the configuration that the processes read: with the names of the objects, a free port, and the names of
+    the services that must be ready first. Raises SaccadeError if the object set is unknown."""
     names = config.scene.names or names_of(config.scene.objects)
     return config.with_values({"bus.endpoint": free_endpoint(config.bus.endpoint), "scene.names": list(names),
                                "bus.wait_for": [process.name for process in processes[2:] if not process.onlooker]})
@@ -145,7 +151,7 @@ def _prepare(run_dir: Path) -> None:
 
 
 def messages(arrived: queue.SimpleQueue[Item], bus: Bus, watch: Watch, run: str) -> Iterator[Told | None]:
-    """(topic, part, message) as they arrive, each once, and None when nothing did."""
+    """Yields (topic, part, message) as they arrive, each once, and None when nothing arrived."""
     sequences, looked_s, news_s = Sequences(), time.monotonic(), time.monotonic()
     while True:
         now_s = time.monotonic()
@@ -157,7 +163,7 @@ def messages(arrived: queue.SimpleQueue[Item], bus: Bus, watch: Watch, run: str)
             for topic, part, payload, *_ in bus.recall((RESULT,), (run, 0, 0)):
                 arrived.put((topic, part, payload))
         item: Told | None = None
-        with suppress(queue.Empty, MessageError):  # whoever subscribes to an invalid message counts it
+        with suppress(queue.Empty, MessageError):  # a service that gets an invalid message counts it
             topic, part, payload = arrived.get(timeout=POLL_S)
             message = decode(topic.type, payload)
             if isinstance(message, Status) and part is not None:
@@ -179,6 +185,8 @@ def _await_router(messages: Iterator[Told | None], router: Process) -> None:
 
 def follow(told: Iterable[Told | None], watch: Watch, processes: Sequence[Process],
            on_message: OnMessage | None) -> list[Result]:
+    """Follows a run until it is over, and returns its results in the order of the episodes. Raises SaccadeError if a
+    service is not ready within READY_S."""
     starting = {process.name for process in processes[1:] if not process.onlooker}
     course = _Course(processes[1].name, judged=JUDGE in starting)
     over_s, deadline_s = None, time.monotonic() + READY_S
@@ -200,16 +208,16 @@ def follow(told: Iterable[Told | None], watch: Watch, processes: Sequence[Proces
 
 
 class _Course:
-    """How far a run has come."""
+    """Keeps track of how far a run has come."""
 
     def __init__(self, source: str, *, judged: bool) -> None:
         self.results: dict[int, Result] = {}
         self._source, self._judged = source, judged
-        self._end: tuple[int, int] | None = None  # episode and step that the source published last
+        self._end: tuple[int, int] | None = None  # the last episode and step of the source
         self._planned, self._news_s = (-1, -1), time.monotonic()
 
     def take(self, topic: Topic, part: str | None, message: Message) -> None:
-        """Any message."""
+        """Takes any message."""
         if topic.in_step:
             self._news_s = time.monotonic()
         if isinstance(message, Result):
@@ -221,8 +229,8 @@ class _Course:
 
     @property
     def over(self) -> bool:
-        """Whether the source has finished and every episode has its result; where nobody judges, the last frame its
-        plan."""
+        """Whether the source has finished and every episode has its result. If nobody judges, the last frame must have
+        its plan instead."""
         if self._end is None:
             return False
         if self._judged:
@@ -231,14 +239,14 @@ class _Course:
 
 
 def _drain(messages: Iterator[Told | None], on_message: OnMessage | None) -> None:
-    """What was still on its way when the services were stopped."""
+    """Takes the messages that were still on their way when the services were stopped."""
     while on_message is not None and (item := next(messages)) is not None:
         on_message(*item)
 
 
 @contextmanager
 def _terminable() -> Iterator[None]:
-    """SIGTERM ends the run as Ctrl-C does."""
+    """Within this context SIGTERM ends the run like Ctrl-C."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -1,5 +1,5 @@
-"""Which cores make an agent and a world, by name; the processes of a run and the pairs of an in-process run derive from
-it."""
+"""Lists by name which services make an agent and a world. The processes of a run, and the cores of an in-process run,
+are derived from this list."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ ROUTER, RECORDER = "router", "recorder"
 
 @dataclass(frozen=True)
 class World:
-    """Where images come from and, maybe, actions go: the service `source`. `judges` hear its truth, where it has one;
-    one that is `live` waits for nobody."""
+    """Where images come from and where actions may go: the service `source`. `judges` are the services that compare
+    with its truth, if it has one. A world that is `live` waits for nobody."""
 
     source: str
     judges: tuple[str, ...] = ()
@@ -40,11 +40,12 @@ DEFAULT_WORLD = "simulator"
 
 @dataclass(frozen=True)
 class Agent:
-    """`services` are processes of their own; `cores` are modules that run within one alone."""
+    """What an agent consists of: `services` are processes of their own, `cores` are modules that run only within one
+    process."""
 
     services: tuple[str, ...] = ()
     cores: tuple[str, ...] = ()
-    weights: bool = True  # whether it needs trained ones
+    weights: bool = True  # whether it needs trained weights
 
 
 AGENTS = {
@@ -54,30 +55,32 @@ AGENTS = {
 
 
 def agent_of(name: str) -> Agent:
-    """The agent of that name; raises SaccadeError for an unknown one."""
+    """Returns the agent of that name. Raises SaccadeError if the name is unknown."""
     if name not in AGENTS:
         raise SaccadeError(f"agent {name!r} is unknown: choose from {', '.join(AGENTS)}")
     return AGENTS[name]
 
 
 def world_of(name: str) -> World:
-    """The world of that name; raises SaccadeError for an unknown one."""
+    """Returns the world of that name. Raises SaccadeError if the name is unknown."""
     if name not in WORLDS:
         raise SaccadeError(f"world {name!r} is unknown: choose from {', '.join(WORLDS)}")
     return WORLDS[name]
 
 
 def agent_pairs(agent: str, config: Config) -> list[Pair]:
-    """Declarations and cores of an agent, built for a configuration whose objects are named."""
+    """Builds the declarations and cores of an agent. The configuration must name the objects. Raises SaccadeError if
+    the agent is unknown."""
     chosen = agent_of(agent)
     return pairs_of(chosen.services, config) + [_core(module, config) for module in chosen.cores]
 
 
 def local_pairs(agent: str, config: Config, world: str = DEFAULT_WORLD) -> list[Pair]:
-    """Everything that an in-process run needs: the source, the agent, who judges it. Raises SaccadeError for an agent
-    that must be told a truth which the world does not know.
+    """Builds everything that an in-process run needs: the source, the agent and its judges. Raises SaccadeError if the
+    agent must be told the truth, and the world does not know it.
 
-    Limits torch's threads as the launcher does for its processes: else the bytes would not be those of the bus.
+    PyTorch gets as many threads as in the launcher's processes. With another number the bytes would differ from those
+    on the bus.
     """
     limit_torch()
     chosen = world_of(world)
@@ -90,8 +93,8 @@ def local_pairs(agent: str, config: Config, world: str = DEFAULT_WORLD) -> list[
 
 
 def agent_processes(agent: str, world: str = DEFAULT_WORLD, *, view: bool = False) -> tuple[Process, ...]:
-    """The processes of a run on the bus, the router first and the source second; with `view` the viewer last. Raises
-    SaccadeError for an agent that has none of its own."""
+    """Returns the processes of a run on the bus: the router first, the source second, and with `view` the viewer last.
+    Raises SaccadeError if the agent runs only within one process."""
     chosen, place = agent_of(agent), world_of(world)
     if chosen.cores:
         raise SaccadeError(f"agent {agent!r} runs within one process only: add `--bus local`")
@@ -100,9 +103,10 @@ def agent_processes(agent: str, world: str = DEFAULT_WORLD, *, view: bool = Fals
 
 
 def weight_hashes(agent: str, config: Config) -> dict[str, str]:
-    """Hashes of the weights that an agent works with, by file; none for one that needs none.
+    """Returns the hashes of the weights that an agent works with, by file. It is empty for an agent that needs no
+    weights.
 
-    Raises SaccadeError where they are missing, damaged or lack one of the run's objects.
+    Raises SaccadeError if the weights are missing or damaged, or if they lack one of the run's objects.
     """
     if not agent_of(agent).weights:
         return {}
@@ -114,20 +118,20 @@ def weight_hashes(agent: str, config: Config) -> dict[str, str]:
 
 
 def service_of(name: str, config: Config | None = None) -> Service:
-    """The declaration of a service of a run, or of ours."""
+    """Returns the declaration of a service: the one that the configuration puts in its place, else Saccade's own."""
     return load(name, config or Config()).service
 
 
 def pairs_of(names: Sequence[str], config: Config) -> list[Pair]:
-    """Declarations and cores of services, built for a configuration whose objects are named. Raises SaccadeError for a
-    module from outside that is none."""
+    """Builds the declarations and cores of services. The configuration must name the objects. Raises SaccadeError if a
+    user's module is not a service."""
     limit_torch()
     modules = [load(name, config) for name in names]
     return [(module.service, module.build(config)) for module in modules]
 
 
 def require_services(agent: str, config: Config, world: str) -> None:
-    """Raises SaccadeError for a module from outside that is none: before any process starts."""
+    """Checks the user's modules before any process starts. Raises SaccadeError if one of them is not a service."""
     for name in (world_of(world).source, *agent_of(agent).services):
         if getattr(config.services, "source" if name in SOURCES else name) is not None:
             load(name, config)

@@ -1,4 +1,4 @@
-"""`saccade run`: one run of the agent, logged whole; on the bus, or in this one process."""
+"""`saccade run` runs an agent and logs everything, on the bus or within this process."""
 
 from __future__ import annotations
 
@@ -47,9 +47,13 @@ class Finished:
 
 def run(config: Config, *, agent: str, out: Path | None, plain: bool, console: Console | None = None,
         world: str = DEFAULT_WORLD, view: bool = False, after: Callable[[Finished], None] | None = None) -> Finished:
-    """Runs all episodes of a configuration into a new folder; prints how they ended and where it is. Ctrl-C is one of
-    the ends that the run of a real camera has. With `view` the run can be looked at. `after` is called when the run is
-    over and its viewer still there; a run that was interrupted has none."""
+    """Runs all episodes of a configuration into a new folder, and prints how they ended.
+
+    A run with a real camera may also be ended by Ctrl-C. With `view` the run can be watched in a browser. `after` is
+    called when the run is over, while the viewer is still there; a run that was interrupted has no viewer any more.
+    Raises SaccadeError if the run cannot be started as it is configured, if the folder is not new, or if a service
+    fails.
+    """
     console, place = console or Console(), world_of(world)
     config = resolve(in_world(config, world))
     require_services(agent, config, world)
@@ -58,7 +62,7 @@ def run(config: Config, *, agent: str, out: Path | None, plain: bool, console: C
         config = to_be_viewed(config)
     processes = agent_processes(agent, world, view=view) if config.bus.kind == "zenoh" else ()
     folder = _new_folder(out or Path("runs") / f"{time.strftime('%Y%m%d-%H%M%S')}-{config.seed}")
-    ended = None  # of a run that was interrupted nothing stays to be looked at
+    ended = None  # stays None if the run is interrupted: then no viewer stays
     with ExitStack() as stack:
         with Display(console, plain=plain, judged=config.scene.goal_view_is_known,
                      camera=place.source if place.live else None) as display:
@@ -84,7 +88,7 @@ def run(config: Config, *, agent: str, out: Path | None, plain: bool, console: C
 
 
 def to_be_viewed(config: Config) -> Config:
-    """The configuration with the ports that its viewer will have. Raises SaccadeError where it can have none."""
+    """Returns the configuration with free ports for the viewer. Raises SaccadeError if the run cannot have a viewer."""
     if config.bus.kind != "zenoh":
         raise SaccadeError("--view is for services on the bus: leave `--bus local` out, or look at the log with "
                            "`saccade view`")
@@ -93,8 +97,8 @@ def to_be_viewed(config: Config) -> Config:
 
 
 def in_world(config: Config, world: str) -> Config:
-    """The configuration as that world has it. Raises SaccadeError for one that it has no use for, and for a camera that
-    cannot be: before anything starts."""
+    """Returns the configuration for that world. Raises SaccadeError if the world has no use for one of its keys, or if
+    the camera's source cannot be used. This is checked before anything starts."""
     scene, camera = config.scene, config.camera
     if not world_of(world).live:
         if camera.source is not None:
@@ -107,12 +111,12 @@ def in_world(config: Config, world: str) -> Config:
                                  "bus.live": config.bus.kind == "zenoh"})
     from_outside = config.services.source is not None
     if not from_outside and (camera.source is None or webcam_number(camera.source) is None):
-        build_camera(config)  # but for a webcam, which would be switched on and off
+        build_camera(config)  # not for a webcam, because this would switch it on and off
     return config
 
 
 def resolve(config: Config) -> Config:
-    """The configuration with its objects named and its paths absolute."""
+    """Returns the configuration with the names of its objects and with absolute paths."""
     scene = config.scene
     paths = {"scene.file": scene.file, "scene.goal_image": scene.goal_image,
              "camera.poses": config.camera.poses, "perception.weights": config.perception.weights}
@@ -122,7 +126,8 @@ def resolve(config: Config) -> Config:
 
 
 def require_weights(agent: str, config: Config) -> None:
-    """Raises SaccadeError where the agent's weights are missing: before any process starts, and without torch."""
+    """Checks for the agent's weights before any process starts, without loading PyTorch. Raises SaccadeError if they
+    are missing."""
     if agent_of(agent).weights and not (config.weights / MANIFEST_NAME).is_file():
         from saccade.shared.model.weights import Weights
 
@@ -130,7 +135,7 @@ def require_weights(agent: str, config: Config) -> None:
 
 
 def run_here(config: Config, agent: str, folder: Path, display: Display, world: str = DEFAULT_WORLD) -> list[Result]:
-    """The run within this process, logged as on the bus. A log that can take no more does not stop it."""
+    """Runs within this process, and logs as on the bus. If the log cannot take any more, the run goes on without it."""
     pairs = local_pairs(agent, config, world)
     source = pairs[0][1]
     folder.mkdir(parents=True, exist_ok=True)
@@ -140,10 +145,10 @@ def run_here(config: Config, agent: str, folder: Path, display: Display, world: 
 
     def on_message(topic: Topic, part: str | None, message: Message, payload: bytes | None) -> None:
         end_if_interrupted()
-        assert payload is not None  # since all is encoded
+        assert payload is not None  # because of encoded=True
         try:
             log.write(topic, part, payload, sequence=message.seq)
-        except RecordingStopped as error:  # once; what follows is not logged
+        except RecordingStopped as error:  # raised once; later messages are not logged
             print(f"saccade: {error}", file=sys.stderr)
         display.take(topic, part, message)
 
@@ -160,8 +165,8 @@ def run_here(config: Config, agent: str, folder: Path, display: Display, world: 
 
 @contextmanager
 def _interrupted_between_messages() -> Iterator[Callable[[], None]]:
-    """Ctrl-C takes effect where what is yielded is called: within a write it would tear the log. A second one, at
-    once."""
+    """Yields a function. Ctrl-C takes effect where this function is called, because an interruption within a write
+    would damage the log. A second Ctrl-C takes effect at once."""
     interrupted = threading.Event()
 
     def raise_if_interrupted() -> None:

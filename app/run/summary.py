@@ -1,4 +1,4 @@
-"""How a run ended, in words."""
+"""Says in words how a run ended."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from saccade.shared.config import Config
 
 
 def summary(config: Config, results: list[Result], progress: Progress) -> list[str]:
-    """How a run ended, a line each: its results, what the agent itself says, what it found."""
+    """Returns lines that say how a run ended: its results, what the agent itself says, and what it found."""
     lines = [_result_line(config, result) for result in results]
     if config.camera.source is not None:
         lines += _camera_lines(config, progress)
@@ -24,7 +24,7 @@ def summary(config: Config, results: list[Result], progress: Progress) -> list[s
 
 
 def _doubts(config: Config, progress: Progress) -> list[str]:
-    """What the agent itself says, after the last episode, of why there was nothing to reach."""
+    """What the agent itself says, after the last episode, about why there was nothing to reach."""
     plan = progress.plan
     if plan is None or config.scene.explore:
         return []
@@ -38,7 +38,7 @@ def _doubts(config: Config, progress: Progress) -> list[str]:
 
 
 def _result_line(config: Config, result: Result) -> str:
-    """How one episode ended; errors only where the goal's true view is known."""
+    """How one episode ended. It gives errors only if the goal's true view is known."""
     if config.scene.explore:
         return f"{result.scene}: explored for {result.steps} steps"
     if config.scene.goal_image is not None:
@@ -51,7 +51,8 @@ def _result_line(config: Config, result: Result) -> str:
 
 
 def _camera_lines(config: Config, progress: Progress) -> list[str]:
-    """What was seen, and what the agent says of the goal; a real camera has no truth to judge it by."""
+    """What was seen, and what the agent says about the goal. A real camera has no truth with which this could be
+    judged."""
     views = 0 if progress.at is None else progress.at[1] + 1
     skipped = {name: status.skipped for name, status in sorted(progress.statuses.items()) if status.skipped}
     without_pose = skipped.pop("camera", 0)

@@ -1,4 +1,5 @@
-"""One thread a process: sums of networks and matrices depend on their number, and services share the cores."""
+"""One thread for each process. The sums in networks and matrices depend on the number of threads, and the services
+share the cores."""
 
 from __future__ import annotations
 
@@ -8,18 +9,20 @@ VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 def prefer_one_thread() -> None:
-    """For this process and those that it starts, unless the user's environment says otherwise. Before NumPy loads."""
+    """Sets one thread for this process and those that it starts, unless the user's environment sets another number. It
+    must be called before NumPy is loaded."""
     for name in VARIABLES:
         os.environ.setdefault(name, "1")
 
 
 def enforce_one_thread() -> None:
-    """For the processes that are started from here on, whatever the environment says."""
+    """Sets one thread for all processes that are started from now on, whatever the environment says."""
     os.environ.update(dict.fromkeys(VARIABLES, "1"))
 
 
 def limit_torch() -> None:
-    """What the environment says, one where it says nothing, also where torch was loaded before."""
+    """Gives PyTorch the number of threads in the environment, by default one. It also works after PyTorch was
+    loaded."""
     import torch
 
     torch.set_num_threads(int(os.environ.get(VARIABLES[0], "1")))
