@@ -1,9 +1,11 @@
-"""`python -m saccade.deploy.container SERVICE`: a service where something else starts and restarts it, such as Docker.
+"""`python -m saccade.deploy.container SERVICE` runs a service where something else starts and restarts it, such as
+Docker.
 
-One process for each world of the newest run in SACCADE_RUNS, or for world number SACCADE_WORLD alone, until that run is
-over; the viewer shows the first of them and stays for SACCADE_VIEW_S seconds more. With SACCADE_WAIT set it waits until
-there is one. It ends with code 1 when one of them died or hung, so that it is started again; a service that said why it
-cannot run stays down until then.
+It runs one process for each world of the newest run in SACCADE_RUNS, or only for the world with the number
+SACCADE_WORLD, until that run is over. The viewer shows only the first world, and stays for SACCADE_VIEW_S seconds after
+the run. With SACCADE_WAIT set, it waits until there is a run. If a process dies or hangs, it ends with code 1, so that
+it is started again. A process that says why it cannot run does not end the others. It stays down, and the exit code at
+the end is 2.
 """
 
 from __future__ import annotations
@@ -26,35 +28,36 @@ from saccade.shared.loop.process import EXIT_ERROR, HEARTBEAT_VARIABLE, LAUNCHER
 
 RUNS_VARIABLE, HEARTBEATS_VARIABLE = "SACCADE_RUNS", "SACCADE_HEARTBEATS"
 WORLD_VARIABLE, WAIT_VARIABLE = "SACCADE_WORLD", "SACCADE_WAIT"
-LATEST, OVER = "latest", "over"  # in the folder of the runs, and in the one of a run
-ONE_FOR_ALL = ("router", "viewer")  # worlds share the first, and the other shows the first of them
-VIEW_VARIABLE, VIEW_S = "SACCADE_VIEW_S", 300.0  # for so long a run that is over can still be looked at
+LATEST, OVER = "latest", "over"  # a link to the newest run, and a mark in the folder of a world that is over
+ONE_FOR_ALL = ("router", "viewer")  # all worlds share the router, and the viewer shows the first world
+VIEW_VARIABLE, VIEW_S = "SACCADE_VIEW_S", 300.0  # the viewer stays so long after a run
 POLL_S = 0.2
-ROUTER_S = 60.0  # for the router to answer: containers start in any order
-STOP_UNBEGUN_S = 3.0  # for a process that is told to stop before it has begun: what it waits for may not come any more
+ROUTER_S = 60.0  # a service waits so long for the router, because containers start in any order
+# A process that is told to stop before it has begun gets less time: what it waits for may never come.
+STOP_UNBEGUN_S = 3.0
 EXIT_AGAIN = 1
 
 
 def runs_folder() -> Path:
-    """Where runs are, for containers."""
+    """The folder of the runs: SACCADE_RUNS, else `runs`."""
     return Path(os.environ.get(RUNS_VARIABLE, "runs"))
 
 
 def heartbeat_file(name: str) -> Path:
-    """Where a container's process says that it is well; `healthy.sh` looks there."""
+    """The file in which a process of this container says that it is well. `healthy.sh` reads it."""
     folder = Path(os.environ.get(HEARTBEATS_VARIABLE, "/tmp/heartbeats"))
     folder.mkdir(parents=True, exist_ok=True)
     return folder / name
 
 
 def worlds_of(run: Path) -> list[Path]:
-    """The folders of the worlds of a run that goes on: its own, or those in it; none where it is over."""
+    """The folders of the worlds of a run: its own folder, or those in it. It is empty if the run is over."""
     own = [run] if (run / CONFIG_NAME).is_file() else sorted(path.parent for path in run.glob(f"*/{CONFIG_NAME}"))
     return [] if all((world / OVER).exists() for world in own) else [world.resolve() for world in own]
 
 
 def mine(name: str, worlds: list[Path]) -> list[Path]:
-    """Those that this container serves. Raises SaccadeError where it is told to serve one that is not there."""
+    """The worlds that this container serves. Raises SaccadeError if SACCADE_WORLD names a world that is not there."""
     if name in ONE_FOR_ALL:
         return worlds[:1]
     number = os.environ.get(WORLD_VARIABLE)
@@ -66,7 +69,7 @@ def mine(name: str, worlds: list[Path]) -> list[Path]:
 
 
 class Container:
-    """The processes of one service."""
+    """The processes of one service, one for each world."""
 
     def __init__(self, name: str) -> None:
         self._name, self._stopping = name, threading.Event()
@@ -80,15 +83,16 @@ class Container:
                                  world / CONFIG_NAME], env=environment, start_new_session=True)
 
     def _heartbeat(self, world: Path) -> Path:
-        """Of one of its own: other services may be on the same host, without containers."""
+        """The heartbeat file of one process. The names differ, because other services may run on the same host without
+        containers."""
         return heartbeat_file(f"{self._name}-{world.name}")
 
     def stop(self, *_: object) -> None:
-        """Ends them; safe in a signal handler."""
+        """Makes `run` end the processes. It is safe in a signal handler."""
         self._stopping.set()
 
     def run(self) -> int:
-        """Until the run is over or `stop` was called; the exit code. Raises SaccadeError, see `mine`."""
+        """Runs until the run is over or `stop` was called. Returns the exit code. Raises SaccadeError like `mine`."""
         latest = runs_folder() / LATEST
         if not worlds_of(latest):
             if not os.environ.get(WAIT_VARIABLE):
@@ -108,10 +112,10 @@ class Container:
         return EXIT_ERROR if any(child.returncode == EXIT_ERROR for child in self._children.values()) else 0
 
     def _stay(self) -> None:
-        """A run that is over can still be looked at."""
+        """Keeps the viewer for a while after the run, so that the run can still be looked at."""
         stay_s = float(os.environ.get(VIEW_VARIABLE, VIEW_S))
         if self._name == VIEWER.name and stay_s and not self._stopping.is_set():
-            print(f"saccade: the run is over and stays to be seen for {stay_s:.0f} s", file=sys.stderr, flush=True)
+            print(f"saccade: the run is over; the viewer stays for {stay_s:.0f} s", file=sys.stderr, flush=True)
             self._stopping.wait(stay_s)
 
     def _died(self) -> bool:
@@ -146,7 +150,7 @@ class Container:
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Exit code 2, with one line, where it cannot."""
+    """Runs the service that the command line names. If it cannot, it prints one line and ends with exit code 2."""
     name, = sys.argv[1:] if argv is None else argv
     container = Container(name)
     for number in (signal.SIGTERM, signal.SIGINT):

@@ -1,8 +1,7 @@
-"""`python -m saccade.deploy.director`: prepares a run for services that something else starts, such as Docker; follows
-it and says how it ended.
+"""`python -m saccade.deploy.director` prepares a run, follows it, and says how it ended.
 
-It writes the configuration of each world into a new folder in SACCADE_RUNS, which every service reads, and at the end a
-file that tells them that it is over.
+It is for services that something else starts, such as Docker. It writes the configuration of each world into a new
+folder in SACCADE_RUNS, where every service reads it. At the end it writes a file that tells them that the run is over.
 """
 
 from __future__ import annotations
@@ -44,30 +43,31 @@ BEAT_S = 0.5
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Exit code 2, with one line, where the run cannot be prepared or does not come to its end."""
+    """Directs one run. If the run cannot be prepared or does not come to its end, it prints one line and ends with exit
+    code 2."""
     parser = argparse.ArgumentParser(prog="python -m saccade.deploy.director", description=__doc__.splitlines()[0])
     parser.add_argument("--endpoint", default="tcp/127.0.0.1:7447", help="the router's address, for the services")
-    parser.add_argument("--listen", help="where the router listens, if that is another one")
+    parser.add_argument("--listen", help="the address at which the router listens, if it is another one")
     parser.add_argument("--objects", default=None, help="object set: pantry, ycb")
     parser.add_argument("--weights", default=None, help="a folder of weights, or its name in weights/")
     parser.add_argument("--seed", type=int, default=None)
-    parser.add_argument("--count", type=int, default=None, help="scenes, one after the other")
-    parser.add_argument("--worlds", type=int, default=1, help="scenes at once")
+    parser.add_argument("--count", type=int, default=None, help="number of scenes, one after the other")
+    parser.add_argument("--worlds", type=int, default=1, help="number of worlds, side by side")
     parser.add_argument("--world", default=DEFAULT_WORLD, help=f"one of {', '.join(WORLDS)}")
-    parser.add_argument("--source", help="of a camera's images: a folder or a video")
-    parser.add_argument("--poses", help="where that camera was: JSON lines or TUM")
-    parser.add_argument("--intrinsics", metavar="fx,fy,cx,cy", help="of its images, in pixels")
-    parser.add_argument("--view-port", type=int, help="of the viewer's page, open to other hosts")
-    parser.add_argument("--view-data-port", type=int, default=9876, help="of its data")
+    parser.add_argument("--source", help="images of a camera: a folder or a video")
+    parser.add_argument("--poses", help="poses of that camera: JSON lines or TUM")
+    parser.add_argument("--intrinsics", metavar="fx,fy,cx,cy", help="intrinsics of its images, in pixels")
+    parser.add_argument("--view-port", type=int, help="port of the viewer's page, open to other hosts")
+    parser.add_argument("--view-data-port", type=int, default=9876, help="port of the viewer's data")
     parser.add_argument("--set", default="", metavar="'KEY=VALUE ...'", help="configuration by dotted keys")
     told = parser.parse_args(argv)
-    signal.signal(signal.SIGTERM, lambda *_: os._exit(0))  # its threads wait for messages; nothing is unsaved
+    signal.signal(signal.SIGTERM, lambda *_: os._exit(0))  # its threads wait for messages, and nothing is left to save
     try:
         given = {"bus.endpoint": told.endpoint, "bus.listen": told.listen, "scene.objects": told.objects,
                  "perception.weights": weights_folder(told.weights), "seed": told.seed, "scene.count": told.count,
                  "camera.source": told.source or None, "camera.poses": told.poses or None,
                  "camera.intrinsics_px": numbers(told.intrinsics or None)}
-        if world_of(told.world).live:  # there is nobody to draw scenes, and nobody waits
+        if world_of(told.world).live:  # a real camera has no scenes to draw, and waits for nobody
             given |= {"scene.count": None, "scene.explore": True, "bus.live": True}
         if told.view_port:
             given |= {"viewer.address": "0.0.0.0", "viewer.port": told.view_port,
@@ -80,7 +80,8 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def direct(config: Config, world: str, worlds: int, runs: Path, console: Console) -> list[Result]:
-    """Prepares a run and follows it to its end: the results of all its worlds. Raises SaccadeError where it cannot."""
+    """Prepares a run and follows it to its end. Returns the results of all its worlds. Raises SaccadeError if it cannot
+    be prepared, or if a service is not ready in time."""
     processes = agent_processes("sceneccn", world)
     folders = prepare(resolve(config, processes), worlds, runs)
     with _Beating():
@@ -95,8 +96,9 @@ def direct(config: Config, world: str, worlds: int, runs: Path, console: Console
 
 
 def prepare(config: Config, worlds: int, runs: Path) -> list[Path]:
-    """Writes the worlds' configurations into a new folder of `runs`, and has `latest` point there. Raises SaccadeError
-    where that cannot be written."""
+    """Writes the configuration of each world into a new folder of `runs`, and makes the link `latest` point to that
+    folder. Returns the folders of the worlds. Raises SaccadeError if they cannot be written, or if `worlds` is less
+    than one."""
     if worlds < 1:
         raise SaccadeError(f"{worlds} worlds: it takes one at least")
     run = runs / f"{time.strftime('%Y%m%d-%H%M%S')}-{config.seed}"
@@ -113,8 +115,8 @@ def prepare(config: Config, worlds: int, runs: Path) -> list[Path]:
         pointer.symlink_to(run.name)
         pointer.replace(runs / LATEST)
     except OSError as error:
-        raise SaccadeError(f"{runs} cannot be written by user {os.getuid()} ({error.strerror}): let its owner's number "
-                           "be SACCADE_UID, or give the folder to that user") from error
+        raise SaccadeError(f"{runs} cannot be written by user {os.getuid()} ({error.strerror}): set SACCADE_UID to "
+                           "the number of its owner, or give the folder to that user") from error
     return folders
 
 
@@ -135,7 +137,8 @@ def _follow(folder: Path, processes: Sequence[Process], console: Console, worlds
 
     with closing(ZenohBus(config.bus.endpoint, world=config.bus.world, timeout_s=ROUTER_S)) as bus:
         bus.subscribe((view, *SHOWN), lambda *item: arrived.put(item))
-        elsewhere = Elsewhere([process.name for process in processes[1:]], tell)  # the router is the first world's
+        # Not the router, which only the first world hears
+        elsewhere = Elsewhere([process.name for process in processes[1:]], tell)
         told = messages(arrived, bus, elsewhere, config.run or folder.name)
         results = follow(told, elsewhere, processes, on_message)
     for text in summary(config, results, progress):
@@ -145,7 +148,8 @@ def _follow(folder: Path, processes: Sequence[Process], console: Console, worlds
 
 
 class Elsewhere:
-    """In the supervisor's place where others start the services: it hears them, and names those that fall silent."""
+    """Takes the supervisor's place where something else starts the services. It hears their heartbeats, and names the
+    services that fall silent."""
 
     def __init__(self, names: Sequence[str], say: Callable[[str], None]) -> None:
         self.stopped = False
@@ -154,26 +158,26 @@ class Elsewhere:
         self._silent: set[str] = set()
 
     def heard(self, name: str, state: str) -> None:
-        """A heartbeat has come."""
+        """Takes a heartbeat of a service."""
         if name in self._silent and name in self._names:
             self._silent.discard(name)
             self._say(f"{name} is heard again")
         self._heard_s[name] = time.monotonic()
 
     def check(self) -> None:
-        """Names who was heard and is not any more."""
+        """Names each service that was heard and is silent now."""
         for name, at_s in self._heard_s.items():
             if name in self._names and name not in self._silent and time.monotonic() - at_s > HUNG_S:
                 self._silent.add(name)
                 self._say(f"nothing is heard of {name} for {HUNG_S:.0f} s")
 
     def settled(self, since_s: float) -> bool:
-        """Whether all were heard since that time."""
+        """Whether all services were heard since that time (monotonic clock, seconds)."""
         return all(self._heard_s.get(name, 0.0) > since_s for name in self._names)
 
 
 class _Beating:
-    """This process's own heartbeat."""
+    """This process's own heartbeat, in a file."""
 
     def __init__(self) -> None:
         self._stop = threading.Event()

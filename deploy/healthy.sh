@@ -1,5 +1,5 @@
 #!/bin/sh
-# Whether every process of this container said within 3 s that it is well.
+# Succeeds if every process of this container said within the last 3 s that it is well.
 cd "${SACCADE_HEARTBEATS:-/tmp/heartbeats}" 2>/dev/null || exit 1
 [ -n "$(ls)" ] || exit 1
 [ -z "$(find . -type f ! -newermt '-3 seconds')" ] || exit 1

@@ -1,5 +1,5 @@
 #!/bin/sh
-# Makes .venv with the pinned dependencies and sees to an OpenGL that works without a screen.
+# Makes .venv with the pinned dependencies. Installs an OpenGL that works without a screen, if there is none.
 # Usage: sh deploy/setup.sh [python3]
 set -eu
 python=${1:-python3}

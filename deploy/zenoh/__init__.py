@@ -1,1 +1,1 @@
-"""A bus over several hosts: certificates, passwords and who may say what."""
+"""A bus over several hosts: certificates, passwords, and which service may publish and read which topic."""

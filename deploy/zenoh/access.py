@@ -1,4 +1,5 @@
-"""Who may say and hear what on the bus, as Zenoh's access control has it: derived from the services' declarations."""
+"""Zenoh's access control: which service may publish and read which topic. It is derived from the services'
+declarations."""
 
 from __future__ import annotations
 
@@ -10,12 +11,12 @@ from saccade.services.viewer import SHOWN
 from saccade.shared.bus.topics import BELIEF, PLAN, RESULT, ROOT, STATUS, TRUTH, Topic
 from saccade.shared.loop.service import Service
 
-SAID = ["put", "reply"]  # by whoever publishes a topic
-ASKED = ["query"]  # by whoever reads it
+SAID = ["put", "reply"]  # messages of a service that publishes a topic
+ASKED = ["query"]  # messages of a service that reads it
 SUBSCRIBED, ANSWERABLE = ["declare_subscriber"], ["declare_queryable"]
 ANY = [f"{ROOT}/**"]
 MET = ["liveliness_token", "liveliness_query", "declare_liveliness_subscriber"]
-READERS: dict[str, tuple[Topic, ...] | None] = {  # beside the services that declare what they read; None: everything
+READERS: dict[str, tuple[Topic, ...] | None] = {  # have no declaration; None means every topic
     "recorder": None,
     "director": (TRUTH, PLAN, BELIEF, STATUS, RESULT),
     "viewer": SHOWN,
@@ -23,19 +24,19 @@ READERS: dict[str, tuple[Topic, ...] | None] = {  # beside the services that dec
 
 
 def declared() -> dict[str, Service]:
-    """The services of all agents and worlds that are processes of their own."""
+    """The declarations, by name, of all services of all agents and worlds that are processes of their own."""
     names = {name for agent in AGENTS.values() for name in agent.services}
     names |= {name for world in WORLDS.values() for name in (world.source, *world.judges)}
     return {name: service_of(name) for name in sorted(names)}
 
 
 def users() -> list[str]:
-    """Everyone who is on the bus, by the name under which the router knows it."""
+    """The names of all who are on the bus, as the router knows them."""
     return sorted({*declared(), *READERS})
 
 
 def access_control() -> dict[str, Any]:
-    """The section `access_control` of the router's configuration: what is not declared is denied."""
+    """The section `access_control` of the router's configuration. What is not declared is denied."""
     rules, policies = [], []
     for user in users():
         of_user = list(_rules(user))
@@ -57,7 +58,8 @@ def _rules(user: str) -> Iterable[dict[str, Any]]:
     yield rule("is asked", ASKED, "egress", says)
     yield rule("asks", ASKED + SUBSCRIBED, "ingress", hears)
     yield rule("is told", SAID, "egress", hears)
-    # that someone listens, maybe to more than this one says, or could answer: without it nothing is sent
+    # Tells a user that another one listens or could answer, perhaps on more keys than its own. Without this Zenoh sends
+    # nothing.
     yield rule("knows who is there", SUBSCRIBED + ANSWERABLE, "egress", ANY)
     members = [f"{ROOT}/*/@members/{user}/*"]
     yield rule("meets", MET, "ingress", members)

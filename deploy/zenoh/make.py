@@ -1,7 +1,8 @@
-"""`python -m saccade.deploy.zenoh.make FOLDER --host NAME`: all that a bus over several hosts needs, in a new folder.
+"""`python -m saccade.deploy.zenoh.make FOLDER --host NAME` makes the files of a bus over several hosts in a new folder.
 
-For the router `router.json5`, its certificate and the passwords; for each service `<service>.json5`, its certificate
-and key; an authority of their own. Copy to each host what is its own, and set ZENOH_CONFIG to the .json5.
+The router gets `router.json5`, a certificate with its key, and the passwords. Each service gets `<service>.json5` and a
+certificate with its key. An authority that is made here signs the certificates. Copy to each host the files of its
+services and the authority's certificate, and set ZENOH_CONFIG to the .json5 file.
 """
 
 from __future__ import annotations
@@ -24,8 +25,9 @@ AUTHORITY, ROUTER = "authority", "router"
 
 
 def make(folder: Path, hosts: Sequence[str], where: Path | None = None) -> None:
-    """Writes everything; in the configurations the files are in `where` (the folder, unless given). Raises SaccadeError
-    where the folder is there already, and where openssl is not."""
+    """Writes all files; only their owner can read them. The configurations name the files in the folder `where`, by
+    default `folder`. Raises SaccadeError if the folder cannot be made, for example because it exists, or if openssl is
+    missing or fails."""
     where = where or folder.resolve()
     try:
         folder.mkdir(mode=0o700, parents=True)
@@ -85,11 +87,11 @@ def _openssl(*arguments: str | Path) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Exit code 2, with one line, where it cannot."""
+    """Makes the folder. If it cannot, it prints one line and ends with exit code 2."""
     parser = argparse.ArgumentParser(prog="python -m saccade.deploy.zenoh.make", description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--host", action="append", required=True, help="name or address of the router; may be repeated")
-    parser.add_argument("--where", type=Path, help="the folder in which they will be, if another")
+    parser.add_argument("--where", type=Path, help="the folder in which the files will be on the hosts")
     told = parser.parse_args(argv)
     try:
         make(told.folder, told.host, told.where)

@@ -57,7 +57,7 @@ def test_up_runs_an_episode_prints_its_result_and_leaves_the_log_to_the_user(com
 def test_the_run_can_be_seen_while_it_goes_on_and_for_a_while_after(compose):
     """As a browser comes to it: the page, and the data that it names. It holds nobody up and ends by itself."""
     compose("up", "--detach", SACCADE_VIEW_S="20")
-    compose.until_said("stays to be seen for 20 s")
+    compose.until_said("the viewer stays for 20 s")
     page = HTTPConnection("127.0.0.1", compose.view_port, timeout=20)
     page.request("GET", "/")
     sent = page.getresponse()
