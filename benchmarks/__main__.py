@@ -1,8 +1,9 @@
-"""`python -m benchmarks`: how cost grows, as ratios measured in one run, so that they mean the same on any machine.
+"""`python -m saccade.benchmarks [out.json]` measures how cost grows, as ratios that mean the same on any machine.
 
-Perception: K objects against K times one, and against what the processor could do: the time that as many operations
-take in a large matrix product. Planning: 5,000 candidates against a plain loop, and 500 to 50,000. Wire: a frame
-encoded and decoded against copying its pixels. Each figure is the median of several repetitions, one thread.
+Perception: K objects are compared with K times one object. They are also compared with what the processor could do: the
+time that as many operations take in a large matrix product. Planning: 5,000 candidates are compared with a plain loop,
+and 500 to 50,000 candidates with 5,000. Wire: encoding and decoding a frame is compared with copying its pixels. Each
+figure is the median of several repetitions on one thread.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from saccade.shared.world.windows import CROP_PX
 
 
 def milliseconds(work: Callable[[], object], repetitions: int = 9) -> float:
-    """Median time of a call, after one to warm up."""
+    """Median time of a call, after one call to warm up."""
     work()
     times = []
     for _ in range(repetitions):
@@ -45,8 +46,8 @@ def milliseconds(work: Callable[[], object], repetitions: int = 9) -> float:
 
 
 def perception() -> list[dict]:
-    """The CCN encoders of K objects in one call, against a loop over them; and all of perception for K objects, where
-    more than the five that there are weights for are the same again."""
+    """Measures the CCN encoders of K objects in one call against a loop over them, and the whole of perception for K
+    objects. There are weights for five objects; for more, the same ones are used again."""
     rows, one = [], 0.0
     for count in (1, 2, 5, 10, 20):
         stacked = Stacked([Encoder() for _ in range(count)])
@@ -74,7 +75,8 @@ def perception() -> list[dict]:
 
 
 def operations_per_ms(side: int = 1024) -> float:
-    """Floating-point operations in a millisecond of a large matrix product: what the processor could do."""
+    """Floating-point operations per millisecond in a large matrix product [side, side]. This is what the processor
+    could do."""
     a, b = torch.rand(side, side), torch.rand(side, side)
     return 2 * side ** 3 / milliseconds(lambda: a @ b)
 
@@ -88,7 +90,8 @@ def _belief(name: str, deviation: float, rng: np.random.Generator) -> Belief:
 
 
 def planning() -> list[dict]:
-    """G of N candidates at once, per candidate against 5,000, and against a loop over single candidates."""
+    """Measures G of N candidates at once, against a loop over single candidates, and the time per candidate against
+    that with 5,000."""
     rng = np.random.default_rng(0)
     beliefs = {name: _belief(name, deviation, rng) for name, deviation in (("a", 0.01), ("b", 0.02), ("c", 0.2))}
     preference = Preference("a", 0.3, 0.025, np.zeros(2), np.array(INTRINSICS_PX), 0.9)
@@ -107,7 +110,7 @@ def planning() -> list[dict]:
 
 
 def wire() -> list[dict]:
-    """A frame encoded and decoded, against copying its pixels."""
+    """Measures encoding and decoding a frame against copying its pixels."""
     frame = Frame(run="b", episode=0, step=0, rgb=np.zeros((480, 480, 3), np.uint8), intrinsics_px=np.ones(4),
                   world_from_camera=np.eye(4))
     copied = milliseconds(lambda: frame.rgb.copy(), 50)
@@ -120,6 +123,7 @@ def wire() -> list[dict]:
 
 
 def main() -> None:
+    """Prints a table. With a file's name it writes the numbers there."""
     torch.set_num_threads(1)
     results = {"perception": perception(), "planning": planning(), "wire": wire()}
     table = Table("what", "ms", "ratio")

@@ -1,7 +1,7 @@
-"""`python -m saccade.benchmarks.constants [out.json]`: what the agent's own constants are worth. Each constant of
-belief and planner, and each number of their configuration, at half and at twice its value, on the 100 development
-scenes. 
-A probability is doubled to 0.99 at most. What is done already in `out.json` is not done again.
+"""`python -m saccade.benchmarks.constants [out.json]` measures what the agent's own constants are worth.
+
+Each constant of belief and planner, and each number of their configuration, is set to half and to twice its value, on
+the 100 development scenes. A probability is set to at most 0.99. What `out.json` holds already is not measured again.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from saccade.shared.log.provenance import commit
 from saccade.shared.loop.local import run_local
 
 SCENES = 100
-DEPENDENT = {"USED_VIEW": "HALF_VIEW_TANGENT"}  # a constant that is computed from another
+DEPENDENT = {"USED_VIEW": "HALF_VIEW_TANGENT"}  # a constant, and one that is computed from it
 
 
 def measure(constant: Constant | None, factor: float) -> list[dict[str, Any]]:
-    """The records of the development scenes with one constant changed."""
+    """Returns the records of the development scenes with one constant multiplied by `factor`."""
     values = {} if constant is None or constant.where not in SECTIONS else {constant.label: constant.changed(factor)}
     config = Config().with_values({"scene.objects": "ycb", **values})
     plan = prepare("sceneccn", config, Path("bench") / "constants.json", suite="dev", limit=SCENES)
@@ -45,7 +45,7 @@ def measure(constant: Constant | None, factor: float) -> list[dict[str, Any]]:
 
 
 class _changed:
-    """Within it a module's constant has another value."""
+    """Within this context a module's constant has another value."""
 
     def __init__(self, constant: Constant | None, factor: float) -> None:
         self._values: dict[str, float] = {}
@@ -68,7 +68,7 @@ class _changed:
 
 
 def told(records: list[dict[str, Any]], default: list[dict[str, Any]]) -> dict[str, Any]:
-    """What a change comes to, against the default's records of the same scenes."""
+    """Summarises what a change does, compared with the default's records of the same scenes."""
     more = [a["steps"] - b["steps"] for a, b in zip(records, default, strict=True)]
     return {"reached": sum(r["success"] for r in records), "median_steps": median(r["steps"] for r in records),
             "mean_steps": round(fmean(r["steps"] for r in records), 2), "more_steps": round(fmean(more), 2),

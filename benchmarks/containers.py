@@ -1,5 +1,8 @@
-"""`python -m saccade.benchmarks.containers [out.json]`: steps per second of `docker compose up` with one, two and three
-replicas of perception, and with and without shared memory between the containers; in turn, round after round."""
+"""`python -m saccade.benchmarks.containers [out.json]` measures the steps per second of `docker compose up`.
+
+It compares one, two and three replicas of perception, and shared memory between the containers with none. The ways take
+turns, round after round.
+"""
 
 from __future__ import annotations
 
@@ -32,6 +35,7 @@ PROJECT = f"saccade-bench-{os.getpid()}"
 
 
 def compose(*arguments: str) -> None:
+    """Runs a command of `docker compose` in a project of its own."""
     environment = {**os.environ, "SACCADE_COUNT": str(SCENES), "SACCADE_SEED": "3", "SACCADE_PORT": "0",
                    "SACCADE_VIEW_S": "0"}
     subprocess.run(["docker", "compose", "-p", PROJECT, *arguments], cwd=PACKAGE, env=environment, check=True,
@@ -39,7 +43,7 @@ def compose(*arguments: str) -> None:
 
 
 def run(replicas: int, files: tuple[str, ...] = ()) -> float:
-    """Steps per second."""
+    """Runs the scenes once, and returns the steps per second."""
     chosen = [argument for name in files for argument in ("-f", name)]
     compose(*chosen, "up", "--scale", f"perception={replicas}")
     compose(*chosen, "down", "--volumes")
@@ -49,7 +53,7 @@ def run(replicas: int, files: tuple[str, ...] = ()) -> float:
 
 
 def perception_ms(objects: int) -> float:
-    """Of one image and so many objects, with a core to itself."""
+    """Median milliseconds of perception for one image and so many objects, with a core to itself."""
     import torch
 
     torch.set_num_threads(1)
@@ -63,7 +67,7 @@ def perception_ms(objects: int) -> float:
 
 
 def without_shared_memory(folder: Path) -> str:
-    """An override that gives every container a /dev/shm of its own."""
+    """Writes a compose file that gives every container a /dev/shm of its own. Returns its path."""
     services = yaml.safe_load((PACKAGE / "compose.yaml").read_text())["services"]
     mounts = {name: [volume for volume in service["volumes"] if "bus-memory" not in volume]
               for name, service in services.items() if any("bus-memory" in v for v in service.get("volumes", ()))}
@@ -73,6 +77,7 @@ def without_shared_memory(folder: Path) -> str:
 
 
 def main() -> None:
+    """Prints a table. With a file's name it writes the numbers there."""
     with tempfile.TemporaryDirectory() as folder:
         alone = ("compose.yaml", without_shared_memory(Path(folder)))
         ways = {f"{n} x perception": partial(run, n) for n in REPLICAS}

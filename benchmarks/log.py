@@ -1,5 +1,8 @@
-"""`python -m saccade.benchmarks.log RUN.mcap [out.json]`: replaying a log as fast as can be into nothing, against
-the mcap library reading the same file; and the memory it takes on a log ten times as long."""
+"""`python -m saccade.benchmarks.log RUN.mcap [out.json]` replays a log as fast as possible without any service.
+
+The speed is compared with that of the mcap library, which reads the same file. The memory is compared with that for a
+log ten times as long.
+"""
 
 from __future__ import annotations
 
@@ -26,19 +29,19 @@ ROUNDS, LONGER = 7, 10
 
 
 def read_by_mcap(log: Path) -> int:
-    """Messages, by the library alone."""
+    """Counts the messages, read by the library alone."""
     with log.open("rb") as stream:
         return sum(1 for _ in make_reader(stream).iter_messages(log_time_order=False))
 
 
 def replay_into_nothing(log: Path) -> int:
-    """Messages when they are due, at once; as `saccade replay` reads them."""
+    """Counts the messages, read and played as `saccade replay` does it, without waiting."""
     everything = Selection(tuple(TOPICS.values()))
     return sum(1 for _ in play(RunReader(log, sums=False).entries(), everything, Pace(), Keys(enabled=False)))
 
 
 def lengthened(log: Path, out: Path) -> None:
-    """The log's episodes many times over, one after the other."""
+    """Writes a log with the log's episodes many times, one after the other."""
     longer = RunLog(out, world="table", configuration="{}")
     for episode in range(LONGER):
         for topic, part, payload, time_ns in RunReader(log).entries():
@@ -50,13 +53,14 @@ def lengthened(log: Path, out: Path) -> None:
 
 
 def peak_mb(log: Path) -> float:
-    """Memory of a process that replays the log into nothing."""
+    """Peak memory of a process that replays the log without any service, in MB."""
     done = subprocess.run([sys.executable, "-m", "saccade.benchmarks.log", "--peak", log], capture_output=True,
                           text=True, check=True)
     return float(done.stdout)
 
 
 def main() -> None:
+    """Prints a table. With a second file's name it writes the numbers there."""
     if sys.argv[1:2] == ["--peak"]:
         replay_into_nothing(Path(sys.argv[2]))
         print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)

@@ -1,5 +1,8 @@
-"""`python -m saccade.benchmarks.loop [out.json]`: closed-loop steps per second over the bus, with and without the
-recorder, against the same cores in one process; the same scenes, in turn, round after round."""
+"""`python -m saccade.benchmarks.loop [out.json]` measures the steps per second of the closed loop.
+
+It compares the bus, with and without the recorder, with the same cores in one process. The scenes are the same. The
+ways take turns, round after round.
+"""
 
 from __future__ import annotations
 
@@ -24,24 +27,24 @@ CONFIG = Config().with_values({"seed": 3, "scene.names": ["coffee_can", "cereal_
 
 
 class Clock:
-    """Steps and seconds, from the first truth to the last."""
+    """Counts steps and seconds, from the first truth to the last."""
 
     def __init__(self) -> None:
         self.seen_s: list[float] = []
 
     def see(self, topic, part, message, payload=None) -> None:
-        """For `on_message`."""
+        """Takes a message, as `on_message` does."""
         if topic == TRUTH:
             self.seen_s.append(time.perf_counter())
 
     @property
     def steps_per_s(self) -> float:
-        """In the closed loop."""
+        """Steps per second in the closed loop."""
         return (len(self.seen_s) - 1) / (self.seen_s[-1] - self.seen_s[0])
 
 
 def here() -> float:
-    """Steps per second in this process, each message encoded and decoded as on the bus."""
+    """Steps per second in this process. Each message is encoded and decoded as on the bus."""
     clock = Clock()
     run_local(local_pairs("sceneccn", CONFIG), CONFIG.names, "loop", on_message=clock.see, encoded=True)
     return clock.steps_per_s
@@ -57,7 +60,7 @@ def on_bus(recorder: bool) -> float:
 
 
 def main() -> None:
-    """Prints a table; with a file's name, writes the numbers there."""
+    """Prints a table. With a file's name it writes the numbers there."""
     ways: dict[str, Callable[[], float]] = {"one process": here, "bus": partial(on_bus, False),
                                             "bus, recorded": partial(on_bus, True)}
     Console().print(compared(in_turn(ways, ROUNDS), "where", ("one process", "bus")))

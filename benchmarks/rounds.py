@@ -1,4 +1,5 @@
-"""Ways of doing the same, measured in turn, round after round: what else a machine does changes by the minute."""
+"""Measures several ways of doing the same in turn, round after round, because the load of a machine changes by the
+minute."""
 
 from __future__ import annotations
 
@@ -14,8 +15,8 @@ Found = dict[str, list[float]]
 
 
 def in_turn(ways: Mapping[str, Callable[[], float]], rounds: int) -> Found:
-    """What each way measured, by rounds; none is always the first, or after the same other. The numbers so far go to
-    the file, if any, that the command line names."""
+    """Returns what each way measured, by rounds. The order changes, so that no way is always the first or always
+    follows the same other. If the command line names a file, the numbers so far are written there."""
     names = list(ways)
     found: Found = {name: [] for name in names}
     for number in range(rounds):
@@ -29,13 +30,13 @@ def in_turn(ways: Mapping[str, Callable[[], float]], rounds: int) -> Found:
 
 
 def ratio(values: Sequence[float], to: Sequence[float]) -> str:
-    """Mean of the rounds' ratios, with its 95 % interval."""
+    """The mean of the rounds' ratios, with its 95 % interval."""
     ratios = np.divide(values, to)
     return f"{ratios.mean():.3f} ± {1.96 * ratios.std(ddof=1) / np.sqrt(len(ratios)):.3f}"
 
 
 def compared(found: Found, what: str, against: Sequence[str]) -> Table:
-    """Medians of steps per second, and ratios to some of the ways."""
+    """Returns a table with the median steps per second of each way, and the ratios to the ways in `against`."""
     table = Table(what, "steps per s", *(f"of {name}" for name in against))
     for name, values in found.items():
         table.add_row(name, f"{np.median(values):.2f}",

@@ -1,7 +1,9 @@
-"""`python -m saccade.benchmarks.soak [minutes [out.json]]`: runs, one after the other, in which a process chosen by
-chance is killed every few seconds; counts what was lost. Each run's actions must be those of the run in one process, to
-the byte.
-The exit code is 1 if anything was lost, said twice or done otherwise."""
+"""`python -m saccade.benchmarks.soak [minutes [out.json]]` kills processes of runs at random, and counts what is lost.
+
+The runs follow one another. Every few seconds a process, chosen at random, is killed. The actions of each run must be
+those of the same run in one process, to the byte. The exit code is 1 if anything was lost, said twice or done
+otherwise.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,7 @@ FAULTS = ("lost episodes", "lost messages", "messages said twice", "runs with ot
 
 
 def child(name: str) -> int | None:
-    """The process id of this process's child of that name."""
+    """Returns the process id of this process's child that runs the service of that name, or None."""
     for path in Path("/proc").glob("[0-9]*/stat"):
         try:
             if int(path.read_text().rsplit(")", 1)[1].split()[1]) != os.getpid():
@@ -48,7 +50,7 @@ def child(name: str) -> int | None:
 
 
 def soak(seed: int, folder: Path, counts: Counter, rng: random.Random) -> None:
-    """One run of several episodes; adds to the counts."""
+    """Runs several episodes once, and adds to the counts."""
     config = Config().with_values({"seed": seed, "scene.names": NAMES, "scene.count": EPISODES})
     due_s = time.monotonic() + rng.uniform(*EVERY_S)
 
@@ -80,7 +82,7 @@ def soak(seed: int, folder: Path, counts: Counter, rng: random.Random) -> None:
 
 
 def main() -> None:
-    """Prints a table; with a file's name, writes the numbers there, after every run."""
+    """Prints a table. With a file's name it writes the numbers there after every run."""
     minutes = float(sys.argv[1]) if len(sys.argv) > 1 else 30.0
     counts: Counter[str] = Counter()
     end_s, seed, rng = time.monotonic() + 60 * minutes, 0, random.Random(0)

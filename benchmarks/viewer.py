@@ -1,6 +1,10 @@
-"""`python -m saccade.benchmarks.viewer [out.json]`: closed-loop steps per second without a viewer, with one that nobody
-uses, with a browser that looks, with one that is suspended, and with a viewer that is suspended; the same scenes, in
-turn, round after round. The browser draws in software, on the same processors, with what the agent leaves of them."""
+"""`python -m saccade.benchmarks.viewer [out.json]` measures what a viewer costs, in steps per second of the closed
+loop.
+
+It compares no viewer, a viewer that nobody uses, a viewer with a browser, a browser that is suspended, and a viewer
+that is suspended. The scenes are the same. The ways take turns, round after round. The browser draws in software on the
+same processors, with the time that the agent leaves.
+"""
 
 from __future__ import annotations
 
@@ -28,14 +32,14 @@ from saccade.services.viewer.server import url_of, with_free_ports
 from saccade.shared.bus.topics import STATUS, TRUTH
 
 ROUNDS = 4
-SUSPENDED_AT = 20  # views, after which a browser or viewer is suspended
+SUSPENDED_AT = 20  # a browser or viewer is suspended after so many views
 FLAGS = ("--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
          "--remote-debugging-port=0", "--window-size=1600,1000")
 
 
 @contextmanager
 def browser(url: str) -> Iterator[int]:
-    """A page in headless Chromium; its process group."""
+    """Opens a page in headless Chromium, and yields its process group."""
     program = shutil.which("chromium") or shutil.which("google-chrome")
     if program is None:
         sys.exit("saccade: no Chromium is installed: apt-get install chromium")
@@ -51,7 +55,8 @@ def browser(url: str) -> Iterator[int]:
 
 
 def measure(view: bool, look: bool = False, suspend: str = "") -> float:
-    """Steps per second. `suspend`: whom, once the run is under way."""
+    """Returns the steps per second. `suspend` names what is suspended once the run is under way: `browser` or
+    `viewer`."""
     config, clock = with_free_ports(CONFIG), Clock()
     pages: list[str] = []
     with tempfile.TemporaryDirectory() as folder, browser(url_of(config.viewer)) if look else nullcontext() as group:
@@ -61,7 +66,7 @@ def measure(view: bool, look: bool = False, suspend: str = "") -> float:
             clock.see(topic, part, message)
             if suspend and len(clock.seen_s) == SUSPENDED_AT:
                 whom = group if suspend == "browser" else viewer_of(folder)
-                assert whom is not None  # who suspends the browser looks with it
+                assert whom is not None  # a suspended browser was opened before
                 os.killpg(whom, signal.SIGSTOP)
 
         launch(config, Path(folder) / "loop", see, agent_processes("sceneccn", view=view), topics=(TRUTH,),
@@ -70,13 +75,13 @@ def measure(view: bool, look: bool = False, suspend: str = "") -> float:
 
 
 def viewer_of(folder: str) -> int:
-    """The process of the viewer of a run in that folder."""
+    """Returns the process id of the viewer of the run in that folder."""
     return next(p.pid for p in psutil.process_iter(["cmdline"])
                 if VIEWER.module in (line := p.info["cmdline"] or []) and any(folder in word for word in line))
 
 
 def main() -> None:
-    """Prints a table; with a file's name, writes the numbers there."""
+    """Prints a table. With a file's name it writes the numbers there."""
     ways = {"no viewer": partial(measure, False), "viewer": partial(measure, True),
             "viewer and browser": partial(measure, True, look=True),
             "browser suspended": partial(measure, True, look=True, suspend="browser"),

@@ -1,1 +1,1 @@
-"""How long a camera image takes from one process to another: our bus beside others, in one run."""
+"""Measures how long a camera image takes from one process to another, over our bus and over others, in one run."""

@@ -1,8 +1,9 @@
-"""`python -m saccade.benchmarks.bus [out.json]`: from process to process, a 480x480 camera image as our encoded Frame.
+"""`python -m saccade.benchmarks.bus [out.json]` sends camera images (480x480) as encoded Frames from process to
+process.
 
-Every contender gets the same bytes at the same pace, in turn, round after round in fresh processes: p50 and p99 of the
-one-way latency, and p50 as a ratio to a plain copy of these bytes and to our bus. `pip install saccade[bench]` installs
-the others; whoever is missing or fails is in the table with the reason.
+Every contender gets the same bytes at the same pace. The contenders take turns, round after round, in fresh processes.
+The table gives p50 and p99 of the one-way latency, and p50 as a ratio to a plain copy of these bytes and to our bus.
+`pip install saccade[bench]` installs the others. A contender that is missing or fails is in the table with the reason.
 """
 
 from __future__ import annotations
@@ -35,11 +36,12 @@ YARDSTICKS = {ENCODED: "memory copy", CODED: "no bus"}
 NOT_INSTALLED = "not installed: pip install saccade[bench]"
 PACKAGES = ("eclipse-zenoh", "pyzmq", "dora-rs", "pyarrow", "msgpack", "numpy")
 
-Latencies = Mapping[tuple[str, str], list[np.ndarray]]  # of transport and payload, per round: nanoseconds [messages]
+# By transport and payload, for each round: nanoseconds [messages]
+Latencies = Mapping[tuple[str, str], list[np.ndarray]]
 
 
 def measure(plan: Plan, contenders: Iterable[Contender]) -> dict[str, Any]:
-    """All contenders, round after round; one that fails is not tried again."""
+    """Measures all contenders, round after round. A contender that fails is not tried again."""
     contenders = list(contenders)
     notes = {c.name: NOT_INSTALLED for c in contenders if not all(find_spec(module) for module in c.modules)}
     rounds: dict[tuple[str, str], list[np.ndarray]] = defaultdict(list)
@@ -61,7 +63,7 @@ def measure(plan: Plan, contenders: Iterable[Contender]) -> dict[str, Any]:
 
 
 def _row(name: str, kind: str, rounds: Latencies) -> dict[str, Any]:
-    """Percentiles over all rounds, milliseconds, and each round's median by itself."""
+    """Percentiles over all rounds (milliseconds), and the median of each round."""
 
     def p50(key: tuple[str, str]) -> float:
         return float(np.median(np.concatenate(rounds[key]))) / 1e6
@@ -86,7 +88,7 @@ def _machine() -> dict[str, Any]:
 
 
 def table(results: Mapping[str, Any]) -> Table:
-    """The rows for the screen."""
+    """Returns the table for the terminal."""
     drawn = Table("transport", "payload", title=f"{results['payload_bytes'] / 1e3:.0f} kB, one way")
     for heading in ("p50 ms", "p99 ms", "of a copy", "of ours"):
         drawn.add_column(heading, justify="right")
@@ -105,6 +107,7 @@ def table(results: Mapping[str, Any]) -> Table:
 
 
 def main() -> None:
+    """Prints the table. With a file's name it writes the results there."""
     results = measure(Plan(), CONTENDERS.values())
     Console().print(table(results))
     if len(sys.argv) > 1:

@@ -1,6 +1,6 @@
-"""Who runs. Names are those of the results.
+"""The contenders, under the names that they have in the results. This command runs one end of a contender:
 
-    python -m saccade.benchmarks.bus.contenders CONTENDER ROLE FOLDER ADDRESS: one end of one of them.
+    python -m saccade.benchmarks.bus.contenders CONTENDER ROLE FOLDER ADDRESS
 """
 
 from __future__ import annotations

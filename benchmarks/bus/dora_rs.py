@@ -1,4 +1,4 @@
-"""dora-rs: a dataflow of two Python nodes under `dora run`, which is its daemon and needs no other."""
+"""dora-rs: a dataflow of two Python nodes under `dora run`, which needs no other daemon."""
 
 from __future__ import annotations
 
@@ -13,12 +13,13 @@ from saccade.benchmarks.bus.measure import Plan, Receive, Send
 from saccade.benchmarks.bus.peer import RECEIVER, ROLES, SENDER, command, run_all
 
 OUTPUT = "frame"
-QUEUE_SIZE = 1000  # beyond it dora drops
+QUEUE_SIZE = 1000  # with more messages dora would drop some
 RUN_DORA = "import sys, dora_cli; sys.argv[0] = 'dora'; sys.exit(dora_cli.py_main())"
 
 
 class DoraRs:
-    """One node sends, one receives; in place (`send_output_raw`, the least copies) or the usual way (`send_output`)."""
+    """One node sends and one receives. They send in place (`send_output_raw`, with the fewest copies), or in the usual
+    way (`send_output`)."""
 
     modules = ("dora", "dora_cli", "pyarrow")
 
@@ -27,7 +28,7 @@ class DoraRs:
         self._in_place = in_place
 
     def run(self, plan: Plan, folder: Path) -> None:
-        """dora starts both ends itself."""
+        """Writes the dataflow; dora itself starts both ends."""
         python, *_ = command(self.name, SENDER, folder, "-")
         nodes: list[dict[str, object]] = [
             {"id": role, "path": python, "args": shlex.join(command(self.name, role, folder, "-")[1:])}
@@ -40,7 +41,7 @@ class DoraRs:
 
     @contextmanager
     def sender(self, address: str) -> Iterator[Send]:
-        """The node's output."""
+        """Sends on the node's output."""
         from dora import Node
 
         node = Node()

@@ -1,7 +1,7 @@
-"""What every contender is measured by: the same frames, the same pace, the same clock.
+"""How every contender is measured: with the same frames, at the same pace, on the same clock.
 
-One-way latency: the sender notes the time right before it takes a message in hand, the receiver when it has it, both on
-the clock that all processes of a machine share.
+The one-way latency is the time between two moments. The sender notes the time right before it begins with a message,
+and the receiver when it has the message. Both use the clock that all processes of a machine share.
 """
 
 from __future__ import annotations
@@ -19,39 +19,39 @@ from saccade.shared.bus.wire import decode, encode
 from saccade.shared.errors import SaccadeError
 from saccade.shared.world.geometry import IMAGE_SIZE_PX
 
-ENCODED, CODED = KINDS = ("bytes", "encode + decode")  # from wire bytes to a buffer of them; from Frame to Frame
-RING = 8  # different images, so that no message finds its bytes in a cache because the last one was the same
-PROBE = b"probe"  # sent until the receiver is known to hear
+ENCODED, CODED = KINDS = ("bytes", "encode + decode")  # from wire bytes to a buffer with them; from Frame to Frame
+RING = 8  # so many different images: with one image, its bytes would still be in a cache
+PROBE = b"probe"  # sent until the receiver is known to receive
 PROBE_S = 0.05
 SETTLE_S = 0.2
 READY = "ready"
 
-Send = Callable[[bytes], object]  # wire bytes on their way
+Send = Callable[[bytes], object]  # sends wire bytes
 Receive = Callable[[], Any]  # waits for the next message and gives a readable buffer of its bytes
 
 
 @dataclass(frozen=True)
 class Plan:
-    """How much is measured: in each round `messages`, after `warmup` that do not count."""
+    """How much is measured: `messages` in each round, after `warmup` messages that do not count."""
 
     rounds: int = 6
     messages: int = 200
     warmup: int = 20
-    period_s: float = 0.01  # between two messages: nothing waits behind another, as in lockstep
+    period_s: float = 0.01  # between two messages, so that none waits behind another, as in lockstep
 
     @property
     def total(self) -> int:
-        """Messages of a round."""
+        """The messages of a round."""
         return self.warmup + self.messages
 
     @property
     def limit_s(self) -> float:
-        """After so long a round has failed, seconds."""
+        """A round that takes longer has failed, seconds."""
         return 30 + self.total * (self.period_s + 0.05)
 
 
 def frames() -> list[Frame]:
-    """RING camera images of noise, the same in every process."""
+    """RING camera images of noise. They are the same in every process."""
     rng = np.random.default_rng(0)
     size = (IMAGE_SIZE_PX, IMAGE_SIZE_PX, 3)
     return [Frame(run="bench", episode=0, step=i, rgb=rng.integers(0, 256, size, dtype=np.uint8),
@@ -59,7 +59,7 @@ def frames() -> list[Frame]:
 
 
 def send_all(plan: Plan, kind: str, send: Send, folder: Path) -> np.ndarray:
-    """Sends a round's messages; when each was begun, nanoseconds [plan.total]."""
+    """Sends the messages of a round. Returns the times at which each was begun, nanoseconds [plan.total]."""
     images = frames()
     payloads = [encode(image) for image in images]
     while not (folder / READY).exists():
@@ -75,7 +75,8 @@ def send_all(plan: Plan, kind: str, send: Send, folder: Path) -> np.ndarray:
 
 
 def receive_all(plan: Plan, kind: str, receive: Receive, folder: Path) -> np.ndarray:
-    """When each of a round's messages was there, nanoseconds [plan.total]. Raises SaccadeError for a wrong one."""
+    """Receives the messages of a round. Returns the times at which each was there, nanoseconds [plan.total]. Raises
+    SaccadeError if a message is not the one that was sent."""
     expected = [np.frombuffer(encode(image), np.uint8) for image in frames()]
     arrived = np.zeros(plan.total, np.int64)
     i = 0
@@ -88,14 +89,14 @@ def receive_all(plan: Plan, kind: str, receive: Receive, folder: Path) -> np.nda
         arrived[i] = time.monotonic_ns()
         if not np.array_equal(np.frombuffer(payload, np.uint8), expected[i % RING]):
             raise SaccadeError(f"message {i} is not the one that was sent")
-        del payload, message  # views of shared memory keep it from being used again
+        del payload, message  # a view of shared memory would keep that memory in use
         i += 1
     return arrived
 
 
 def within_one_process(plan: Plan, kind: str) -> np.ndarray:
-    """The yardsticks, at the same pace: a plain copy of a frame's wire bytes into memory that is there, and encode and
-    decode with no transport between; nanoseconds [plan.total]."""
+    """Measures the two yardsticks at the same pace: a plain copy of a frame's wire bytes into existing memory, and
+    encoding and decoding with no transport between them. Returns nanoseconds [plan.total]."""
     images = frames()
     sources = [np.frombuffer(encode(image), np.uint8) for image in images]
     target = np.empty_like(sources[0])

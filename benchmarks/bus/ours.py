@@ -1,4 +1,5 @@
-"""Our bus as the services use it: a client keeps what it publishes, a process routes, a client's inbox receives."""
+"""Our bus as the services use it. A client keeps what it publishes, a router passes it on, and another client's inbox
+receives it."""
 
 from __future__ import annotations
 
@@ -21,7 +22,7 @@ CONFIG = "config.json"
 
 
 class Ours:
-    """ZenohBus through a router; with shared memory (shm), as is by default, or without."""
+    """ZenohBus through a router, with shared memory (shm, the default) or without it."""
 
     modules = ("zenoh",)
 
@@ -30,7 +31,7 @@ class Ours:
         self._shared_memory = shared_memory
 
     def run(self, plan: Plan, folder: Path) -> None:
-        """The router is the one of every run."""
+        """Runs both ends and a router as in every run."""
         endpoint = free_endpoint("tcp/127.0.0.1:0")
         Config().with_values({"bus.endpoint": endpoint, "bus.world": WORLD}).save(folder / CONFIG)
         router = [sys.executable, "-m", "saccade.services.router", "--config", str(folder / CONFIG)]
@@ -38,7 +39,7 @@ class Ours:
 
     @contextmanager
     def sender(self, address: str) -> Iterator[Send]:
-        """Publishes frames, and keeps them for whoever missed one."""
+        """Publishes frames, and keeps them for a reader that missed one."""
         outbox, frame = Outbox(), frames()[0]
         with closing(self._bus(address)) as bus:
 
@@ -58,7 +59,7 @@ class Ours:
 
             def receive() -> bytes:
                 item = inbox.get()
-                assert item is not None  # nobody stops this inbox
+                assert item is not None  # because nobody stops this inbox
                 return item[2]
 
             yield receive
@@ -70,7 +71,8 @@ class Ours:
 
 @contextmanager
 def _no_shared_memory() -> Iterator[None]:
-    """Clients opened within have it off, whatever the router has. The bus needs no such switch for anything else."""
+    """Clients that are opened in this context do not use shared memory, even if the router does. A patch does it,
+    because the bus itself needs no such switch."""
     import zenoh
 
     plain = zenoh.Config

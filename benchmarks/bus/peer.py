@@ -1,6 +1,6 @@
-"""One end of a contender, a process of its own: `python -m saccade.benchmarks.bus.contenders` starts it.
+"""The two ends of a contender. Each is a process that `python -m saccade.benchmarks.bus.contenders` starts.
 
-FOLDER/round.json says what to do; FOLDER/<role>.npy gets the times.
+FOLDER/round.json says what to do. FOLDER/<role>.npy gets the times.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ STOP_S = 10.0
 
 
 class Contender(Protocol):
-    """A way to bring bytes from one process to another."""
+    """A way to send bytes from one process to another."""
 
     name: str
 
     @property
     def modules(self) -> tuple[str, ...]:
-        """What must be installed."""
+        """The modules that must be installed."""
 
     def run(self, plan: Plan, folder: Path) -> None:
-        """Starts both ends, sees them through and cleans up. Raises SaccadeError if that fails."""
+        """Starts both ends, waits for them and cleans up. Raises SaccadeError if that fails."""
 
     def sender(self, address: str) -> AbstractContextManager[Send]:
         """The sending end, in its own process."""
@@ -56,13 +56,13 @@ def command(name: str, role: str, folder: Path, address: str) -> list[str]:
 
 
 def run_pair(contender: Contender, plan: Plan, folder: Path, address: str, beside: Sequence[str] = ()) -> None:
-    """Runs both ends as processes of ours, and for as long the command `beside`."""
+    """Runs both ends as our own processes. The command `beside` runs as long as they do."""
     run_all([command(contender.name, role, folder, address) for role in ROLES], plan, folder, beside)
 
 
 def run_all(commands: Sequence[Sequence[str]], plan: Plan, folder: Path, beside: Sequence[str] = ()) -> None:
-    """Runs the commands side by side to their end, and for as long the command `beside`, if any. Raises SaccadeError
-    with the last line said if one fails."""
+    """Runs the commands side by side to their end. The command `beside`, if any, runs as long as they do. If a command
+    fails, it raises SaccadeError with the last line that was printed."""
     children: list[subprocess.Popen] = []
     with (folder / LOG).open("ab") as log:
         try:
@@ -98,7 +98,8 @@ def _last_line(folder: Path) -> str:
 
 
 def run_round(contender: Contender, plan: Plan, kind: str) -> np.ndarray:
-    """One round in fresh processes: the latencies, nanoseconds [plan.total]. Raises SaccadeError if it fails."""
+    """Runs one round in fresh processes and returns the latencies, nanoseconds [plan.total]. Raises SaccadeError if it
+    fails."""
     with tempfile.TemporaryDirectory(prefix="bus-") as name:
         folder = Path(name)
         (folder / ROUND).write_text(json.dumps({"kind": kind, "plan": dataclasses.asdict(plan)}))
@@ -110,10 +111,10 @@ def run_round(contender: Contender, plan: Plan, kind: str) -> np.ndarray:
 
 
 def serve(contender: Contender, role: str, folder: Path, address: str) -> None:
-    """One end, from connecting to closing; the sender stays until the receiver has everything."""
+    """Runs one end, from connecting to closing. The sender stays until the receiver has everything."""
     told = json.loads((folder / ROUND).read_text())
     plan, kind = Plan(**told["plan"]), told["kind"]
-    signal.alarm(int(plan.limit_s))  # ends the process also where a library started it and lost it
+    signal.alarm(int(plan.limit_s))  # ends the process even if the library that started it lost it
     if role == SENDER:
         with contender.sender(address) as send:
             _save(send_all(plan, kind, send, folder), folder, role)

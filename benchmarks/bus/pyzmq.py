@@ -1,4 +1,4 @@
-"""pyzmq: PUB and SUB sockets, without copies in Python, over a Unix socket or loopback TCP."""
+"""pyzmq: PUB and SUB sockets over a Unix socket or loopback TCP, without copies in Python."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from saccade.shared.bus.transport import free_endpoint
 
 
 class PyZmq:
-    """One publisher that binds, one subscriber that connects."""
+    """One publisher that binds, and one subscriber that connects."""
 
     modules = ("zmq",)
 
@@ -21,7 +21,7 @@ class PyZmq:
         self._scheme = scheme
 
     def run(self, plan: Plan, folder: Path) -> None:
-        """Nothing stands between the two."""
+        """Runs both ends; no third process is between them."""
         address = f"ipc://{folder}/frames"
         if self._scheme == "tcp":
             address = free_endpoint("tcp/127.0.0.1:0").replace("/", "://", 1)
