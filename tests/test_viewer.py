@@ -223,11 +223,11 @@ def test_what_is_kept_of_a_step_does_not_grow_with_the_run(tmp_path):
 
 
 @pytest.mark.parametrize(("changes", "presence", "words"), [
-    ({"arrived": True}, 0.9, "there"),
+    ({"arrived": True}, 0.9, "arrived at the goal's view"),
     ({"mode": "search", "target": ""}, 0.1, "explore: tomato soup can unseen"),
     ({"mode": "search", "target": "mug"}, 0.1, "look for the mug: tomato soup can unseen"),
-    ({"mode": "search", "target": ""}, 0.9, "explore: all are seen, where they are is not sure"),
-    ({"mode": "approach"}, 0.9, "approach the mug: from where it looks like the goal is not known"),
+    ({"mode": "search", "target": ""}, 0.9, "explore: all are seen, but their positions are uncertain"),
+    ({"mode": "approach"}, 0.9, "approach the mug: the goal's viewpoint is not known yet"),
     ({"mode": "goal", "believed_distance_m": 0.3}, 0.9, "approach: the goal's view of the mug"),
     ({"mode": "goal", "believed_distance_m": 0.05}, 0.9, "centre the mug as in the goal")])
 def test_decisions_in_words(changes, presence, words):

@@ -1,4 +1,4 @@
-"""python -m saccade.services.viewer --config FILE: what the agent sees, believes and plans, for browsers."""
+"""Runs the viewer, which shows a run in web browsers: `python -m saccade.services.viewer --config FILE`."""
 
 from saccade.services.viewer.live import main
 

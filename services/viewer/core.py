@@ -1,6 +1,6 @@
-"""The messages of a run as a Rerun recording: what the agent sees, believes and plans, step by step.
+"""Writes the messages of a run into a Rerun recording: what the agent sees, believes and plans, step by step.
 
-Live and from a log it is the same code. The steps of several episodes follow one another on the timeline `step`.
+The same code serves live runs and logs. On the timeline `step` the episodes of a run follow one another.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from saccade.shared.loop.stepper import settle
 from saccade.shared.model.weights import Weights
 from saccade.shared.world.geometry import IMAGE_SIZE_PX
 
-LIVE_PAUSE_S = 0.5  # between drawings of crops while a run goes on: browsers are sent no more than that either
-WAITING = 64  # images that wait for what is perceived in them
-WITHOUT: dict[Topic, str] = {  # what is not there to be seen without a topic
+LIVE_PAUSE_S = 0.5  # shortest time between two drawings of the crops in a live run; browsers do not get more either
+WAITING = 64  # how many images may wait for their percepts
+WITHOUT: dict[Topic, str] = {  # what cannot be shown if a topic has no messages
     FRAME: "the camera and what it sees", GOAL: "the goal", PERCEPT: "boxes, masks and crops",
     BELIEF: "particles, beliefs, entropy and F", PLAN: "candidates, viewpoints, G and decisions",
     TRUTH: "the true distance to the goal", STATUS: "milliseconds and messages dropped"}
@@ -40,8 +40,11 @@ Shown = TypeVar("Shown", Percept, Belief)
 
 @dataclass
 class Gathered(Generic[Shown]):
-    """Percepts or beliefs of one step, as far as they have come. In lockstep steps follow one another; where a camera
-    does not wait, perception may be some steps behind it, beliefs behind perception."""
+    """The percepts or beliefs of one step that have arrived so far.
+
+    In lockstep one step is complete before the next begins. With a live camera perception may be some steps behind the
+    camera, and the belief some steps behind perception.
+    """
 
     step: int = -1
     frame: Frame | None = None
@@ -49,8 +52,11 @@ class Gathered(Generic[Shown]):
 
 
 class Viewer:
-    """Logs messages to a recording. `truth`: also what the simulator alone knows. `live`: while the run goes on.
-    `lacks`: what cannot be shown because something of ours is missing, in words."""
+    """Writes messages into a Rerun recording.
+
+    With `truth` it also shows what only the simulator knows. `live` says that the run is still going on. `lacks` holds
+    texts that say what cannot be shown because the weights are missing or do not fit.
+    """
 
     def __init__(self, recording: rr.RecordingStream, config: Config, *, truth: bool, live: bool) -> None:
         self._to, self._truth, self._names = recording, truth, list(config.scene.names or ())
@@ -66,17 +72,17 @@ class Viewer:
         self._show: dict[Topic, Callable[[Any], None]] = {
             FRAME: self._frame, GOAL: self._images.goal, PERCEPT: self._percept, BELIEF: self._belief,
             PLAN: self._plan, TRUTH: self._true, RESULT: self._result, STATUS: self._status}
-        self._episode, self._first, self._newest = -1, 0, 0  # which one, where it begins on the timeline, its last step
-        self._frames: dict[int, Frame] = {}  # by step: in which nothing was perceived yet
-        self._seen: Gathered[Percept] = Gathered()  # of the newest step that has any
-        self._held: Gathered[Belief] = Gathered()  # of the newest step that has any
+        self._episode, self._first, self._newest = -1, 0, 0  # its number, its start on the timeline, its last step
+        self._frames: dict[int, Frame] = {}  # by step: the frames whose percepts have not arrived yet
+        self._seen: Gathered[Percept] = Gathered()  # the percepts of the newest step that has any
+        self._held: Gathered[Belief] = Gathered()  # the beliefs of the newest step that has any
         self._believed: dict[str, Belief] = {}
         self._said = ""
         self._came: set[str] = set()
         self._pause_s, self._drawn_s = LIVE_PAUSE_S if live else 0.0, -math.inf
 
     def take(self, topic: Topic, part: str | None, message: Message) -> None:
-        """Any message, in the order of arrival; what is not shown is passed over."""
+        """Takes any message, in the order of arrival. Topics that are not shown are ignored."""
         if topic not in self._show:
             return
         self._came.add(topic.name)
@@ -87,11 +93,11 @@ class Viewer:
         self._show[topic](settle(message))
 
     def dropped(self, count: int) -> None:
-        """So many messages came faster than they could be shown, so far."""
+        """Shows how many messages so far came faster than the viewer could take them."""
         self._curves.dropped("viewer", count)
 
     def close(self) -> list[str]:
-        """Shows what is left of the last step; what could not be shown, in words."""
+        """Shows the rest of the last step. Returns texts that say what could not be shown."""
         self._finish()
         lacks = [*self.lacks, *(f"no {topic.name}: without {what}" for topic, what in WITHOUT.items()
                                 if topic.name not in self._came)]
@@ -130,7 +136,7 @@ class Viewer:
         self._to.set_time(STEP, sequence=self._first + step)
 
     def _finish(self) -> None:
-        """What waits for more of its step."""
+        """Shows what still waits for other messages of its step."""
         for frame in self._frames.values():
             self._at(frame.step)
             self._images.frame(frame)
@@ -141,7 +147,7 @@ class Viewer:
 
     def _frame(self, frame: Frame) -> None:
         self._world.frame(frame)
-        if frame.step <= self._seen.step:  # messages of the past come service by service
+        if frame.step <= self._seen.step:  # when old messages are read, percepts may come before their frames
             self._images.frame(frame)
             return
         self._frames[frame.step] = frame
@@ -149,10 +155,10 @@ class Viewer:
             oldest = self._frames.pop(min(self._frames))
             self._at(oldest.step)
             self._images.frame(oldest)
-            self._at(frame.step)  # what has no step of its own comes now
+            self._at(frame.step)  # messages that belong to no step are shown at the present one
 
     def _percept(self, percept: Percept) -> None:
-        """The images that perception left out are not shown: what was seen stands on the image it was seen in."""
+        """Shows a percept on the image in which it was perceived. Images that perception skipped are not shown."""
         if percept.step > self._seen.step:
             self._draw_crops()
             self._seen = Gathered(percept.step, self._frames.pop(percept.step, None))
@@ -176,7 +182,7 @@ class Viewer:
         self._world.belief(belief)
 
     def _draw_crops(self) -> None:
-        """Of the last step in which something was perceived."""
+        """Draws the crops of the last step that has percepts."""
         seen, self._seen = self._seen, Gathered(self._seen.step)
         if seen.frame is not None and time.monotonic() - self._drawn_s >= self._pause_s:
             self._drawn_s = time.monotonic()

@@ -1,4 +1,4 @@
-"""Numbers over steps."""
+"""Curves: numbers over the steps of a run."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ F_TERMS: dict[str, Colour] = {"total": (230, 230, 230), "pose": (86, 156, 214), 
 G_TERMS: dict[str, Colour] = {"total": (230, 230, 230), "position": (106, 90, 205), "scale": (78, 201, 176),
                               "pose": (86, 156, 214), "information": (206, 120, 80)}
 DISTANCES: dict[str, Colour] = {"believed": (255, 200, 0), "true": (230, 30, 230)}
-SMALLEST_M2 = 1e-8  # variance below which nothing is known more exactly
+SMALLEST_M2 = 1e-8  # variance that is added to a position's covariance, so that its entropy is finite
 
 
 class Curves:
-    """Logs scalars: several series to an entity, as each entity costs whoever draws it."""
+    """Logs numbers. Several series share one entity, because each entity makes drawing slower."""
 
     def __init__(self, recording: rr.RecordingStream, names: Sequence[str],
                  colour_of: Callable[[str], Colour]) -> None:
@@ -34,7 +34,7 @@ class Curves:
             self._to.log(f"distance/{name}", rr.SeriesLines(names=name, colors=colour), static=True)
 
     def beliefs(self, beliefs: dict[str, Belief]) -> None:
-        """Of all objects at one step: entropy and presence of each, the terms of F of all."""
+        """Logs the entropy and presence of each object at one step, and the terms of F summed over the objects."""
         known = [beliefs.get(name) for name in self._names]
         self._numbers("entropy", [np.nan if belief is None else entropy_nats(belief) for belief in known])
         self._numbers("presence", [np.nan if belief is None else belief.presence for belief in known])
@@ -42,24 +42,24 @@ class Curves:
                                 for belief in beliefs.values()) for term in F_TERMS])
 
     def plan(self, plan: Plan) -> None:
-        """The terms of G of the chosen viewpoint, and how far the goal is believed to be."""
+        """Logs the terms of G of the chosen viewpoint, and the believed distance to the goal (m)."""
         self._numbers("G", [plan.g if term == "total" else getattr(plan, f"g_{term}") for term in G_TERMS])
         if plan.believed_distance_m >= 0:
             self._numbers("distance/believed", [plan.believed_distance_m])
 
     def truth(self, truth: Truth) -> None:
-        """How far the goal is."""
+        """Logs the true distance to the goal (m)."""
         apart = (truth.world_from_camera - truth.goal_world_from_camera)[:3, 3]
         self._numbers("distance/true", [float(np.linalg.norm(apart))])
 
     def status(self, status: Status) -> None:
-        """What a service's last step took, and what it did not get or left out."""
+        """Logs how long the last step of a service took, and how many messages it has missed or skipped."""
         if status.milliseconds > 0:
             self._numbers(f"milliseconds/{status.service}", [status.milliseconds])
         self.dropped(status.service, status.skipped + status.gaps)
 
     def dropped(self, service: str, count: int) -> None:
-        """Messages that a service has not taken so far."""
+        """Logs how many messages a service has missed or skipped so far."""
         if self._dropped.get(service) != count:
             self._dropped[service] = count
             self._numbers(f"dropped/{service}", [count])
@@ -69,6 +69,6 @@ class Curves:
 
 
 def entropy_nats(belief: Belief) -> float:
-    """Differential entropy of the position's Gaussian."""
+    """Differential entropy of the position's Gaussian, in nats (positions in metres)."""
     covariance = belief.covariance_m2 + np.eye(3) * SMALLEST_M2
     return float(0.5 * np.linalg.slogdet(2 * np.pi * np.e * covariance)[1])

@@ -1,4 +1,8 @@
-"""The door before Rerun's page: its bare address shows the recording, and the page speaks to its own server alone."""
+"""A small web server in front of Rerun's page.
+
+The plain address of the viewer shows the recording. A content security policy lets the page connect to its own server
+only.
+"""
 
 from __future__ import annotations
 
@@ -9,13 +13,16 @@ from urllib.parse import quote, urlsplit
 from saccade.shared.config import ViewerConfig
 from saccade.shared.errors import SaccadeError
 
-ANSWER_S = 20.0
-KEPT = ("Content-Type", "Content-Encoding", "rerun-final-length")  # headers of the page's files
+ANSWER_S = 20.0  # how long to wait for Rerun's server
+KEPT = ("Content-Type", "Content-Encoding", "rerun-final-length")  # headers that are passed on with the page's files
 
 
 def open_door(config: ViewerConfig, host: str, pages: int, data_port: int) -> ThreadingHTTPServer:
-    """A server at the viewer's address: `/` sends a browser to the recording, whose data is on `data_port`; the rest is
-    what is served at host:pages. Raises SaccadeError where the port cannot be had."""
+    """Opens a web server at the viewer's address.
+
+    `/` redirects a browser to the recording, whose data comes from `data_port`. Every other path is passed on to the
+    server at host:pages. Raises SaccadeError if the port cannot be opened.
+    """
     try:
         door = ThreadingHTTPServer((config.address, config.port), _handler(host, pages, data_port))
     except OSError as error:
@@ -58,13 +65,13 @@ def _handler(page_host: str, pages: int, data_port: int) -> type[BaseHTTPRequest
                 self.wfile.write(body)
 
         def log_message(self, *_: object) -> None:
-            """Nobody needs a line for every file of a page."""
+            """Logs nothing: a line for every file of a page would be of no use."""
 
     return Door
 
 
 def host_of(header: str, otherwise: str) -> str:
-    """The name by which the browser knows this machine, from its Host header; `otherwise` where that is none."""
+    """The name by which the browser knows this machine, from its Host header. `otherwise` if that is not a name."""
     try:
         host = urlsplit(f"//{header}").hostname or ""
     except ValueError:
@@ -75,7 +82,7 @@ def host_of(header: str, otherwise: str) -> str:
 
 
 def policy(host: str, data_port: int) -> str:
-    """The page's content security policy."""
+    """The page's content security policy: the page may connect only to this server and to the recording's data."""
     return ("default-src 'self' 'unsafe-inline' blob: data:; "
             "script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval' blob:; "
             f"connect-src 'self' http://{host}:{data_port} blob: data:")

@@ -1,4 +1,4 @@
-"""What the camera sees and what the networks make of it, as images."""
+"""Images: what the camera sees, what the networks perceive in it, and what they draw."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from saccade.shared.world.windows import CROP_PX
 CAMERA_IMAGE, GOAL_IMAGE, IMAGINED, CROPS = f"{CAMERA}/image", "goal/image", f"{VIEWPOINT}/imagined", "crops/image"
 OF_EPISODE = (CAMERA_IMAGE, GOAL_IMAGE, IMAGINED, CROPS)
 JPEG_QUALITY = 85
-DOT_PX = 12.0  # radius of what stands for a box where the size of the crop is not known
+DOT_PX = 12.0  # radius of the dot that is drawn in place of a box if the size of the crop is not known
 
 
 class Images:
-    """Logs images. Without an imagination there are no crops, no reconstructions and no planned view."""
+    """Logs images. Without an imagination it logs no crops, no reconstructions and no planned view."""
 
     def __init__(self, recording: rr.RecordingStream, names: tuple[str, ...], colour_of: Callable[[str], Colour],
                  imagination: Imagination | None) -> None:
@@ -35,23 +35,23 @@ class Images:
                          static=True)
 
     def begin(self) -> None:
-        """Another episode."""
-        self._seen: dict[str, Percept] = {}  # the last that saw the object
-        self._viewpoint: NDArray[np.float64] | None = None  # for which a view was imagined
+        """Starts another episode: removes the images of the last one."""
+        self._seen: dict[str, Percept] = {}  # for each object the last percept that saw it
+        self._viewpoint: NDArray[np.float64] | None = None  # the viewpoint whose view was imagined last [4, 4]
         for path in OF_EPISODE:
             self._to.log(path, rr.Clear(recursive=True))
 
     def goal(self, goal: Goal) -> None:
-        """The image to reach."""
+        """Logs the goal image."""
         if goal.rgb is not None:
             self._image(GOAL_IMAGE, goal.rgb)
 
     def frame(self, frame: Frame) -> None:
-        """What the camera sees."""
+        """Logs the camera's image."""
         self._image(CAMERA_IMAGE, frame.rgb)
 
     def percept(self, percept: Percept, width_px: int) -> None:
-        """Box, mask, name and presence of an object in the image."""
+        """Logs the box, the mask, the name and the presence of an object in the image, which is `width_px` wide."""
         path = f"{CAMERA_IMAGE}/{rr.escape_entity_path_part(percept.object)}"
         if percept.presence < SEEN:
             self._to.log(path, rr.Clear(recursive=True))
@@ -68,11 +68,11 @@ class Images:
         if mask is not None and mask.any():
             lines = outline(mask) * (width_px / len(mask))
             self._to.log(f"{path}/mask", rr.LineStrips2D(
-                lines,  # type: ignore[arg-type]  # Rerun takes an array [N, 2, 2] for N lines, and does not say so
+                lines,  # type: ignore[arg-type]  # Rerun accepts an array [N, 2, 2] for N lines; its types lack that
                 colors=[colour], radii=0.8, draw_order=20))
 
     def step(self, frame: Frame, percepts: dict[str, Percept]) -> None:
-        """The crops of the objects that a step shows, above what their networks make of them."""
+        """Logs the crops of the objects that are seen at a step, and below them their reconstructions."""
         ordered = [percepts[name] for name in self._names if name in percepts and percepts[name].presence >= SEEN]
         if self._imagination is None:
             return
@@ -86,7 +86,7 @@ class Images:
         self._image(CROPS, canvas)
 
     def plan(self, plan: Plan, beliefs: dict[str, Belief]) -> None:
-        """The view from the chosen viewpoint as imagined, whenever another one is chosen."""
+        """Logs the imagined view from the chosen viewpoint, if this is another one than before."""
         if self._imagination is None or (
                 self._viewpoint is not None and np.array_equal(plan.viewpoint, self._viewpoint)):
             return
@@ -99,7 +99,7 @@ class Images:
 
 
 def outline(mask: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """The edges between cells [M, M] within and without, as lines [N, 2, 2] of (column, row)."""
+    """The outline of a mask [M, M]: the edges between cells inside and outside, as lines [N, 2, 2] of (column, row)."""
     padded = np.pad(mask, 1)
     row, column = np.nonzero(padded[1:, 1:-1] != padded[:-1, 1:-1])
     flat = np.stack([np.stack([column, row], -1), np.stack([column + 1, row], -1)], axis=1)

@@ -1,7 +1,8 @@
-"""What the agent's networks draw: the crops they look at, what they make of them, and the view that is planned.
+"""What the agent's networks see and draw: crops, their reconstructions, and the planned view.
 
-The planned view is imagined object by object, as the generative model has it (paper, section 3.2): each object's latent
-pose is moved to where the camera would be, drawn, and put where its belief would appear.
+The planned view is drawn object by object with the generative model (paper, section 3.2). The transition moves each
+object's latent pose to the planned viewpoint, the decoder draws it, and the drawing is placed where the object would
+appear according to its belief.
 """
 
 from __future__ import annotations
@@ -19,18 +20,24 @@ from saccade.shared.world.windows import CROP_PX, Window
 
 Image = NDArray[np.uint8]
 
-DARK = 24  # of 255: darker than this, a drawn crop is its black background
+DARK = 24  # of 255: a pixel of a drawn crop that is darker than this counts as background
 
 
 def ring_of(window: Window, intrinsics_px: ArrayLike, up: ArrayLike) -> NDArray[np.float64]:
-    """Once round the frame of a window's only crop in the image [5, 2], pixels."""
+    """The frame of a window's only crop in the image: its corners [5, 2] in pixels, the first one repeated.
+
+    `up` [3] is the direction of up in the camera's frame.
+    """
     corners = window.pixels_of(2, intrinsics_px, up)[0]
-    middle, reach = corners.mean((0, 1)), 2.0  # from the centres of 2x2 cells to the corners
+    middle, reach = corners.mean((0, 1)), 2.0  # factor from the centres of 2x2 cells to the corners of the crop
     return middle + reach * (corners.reshape(4, 2)[[0, 1, 3, 2, 0]] - middle)
 
 
 class Imagination:
-    """The networks of a run's objects. Raises SaccadeError where an object has no weights, or others than it says."""
+    """The decoders and transitions of a run's objects.
+
+    Raises SaccadeError if an object has no weights, or if they do not match the manifest.
+    """
 
     def __init__(self, weights: Weights, names: tuple[str, ...]) -> None:
         self.cards = {card.name: card for card in weights.cards_of(names)}
@@ -38,16 +45,16 @@ class Imagination:
         self._transitions = {name: LatentTransition(weights, name) for name in names}
 
     def window(self, percepts: list[Percept]) -> Window:
-        """Where these objects' crops lie."""
+        """The crop windows of these percepts."""
         return Window(np.array([p.pixel for p in percepts]), np.array([p.scale for p in percepts]),
                       np.array([self.cards[p.object].crop_side_m for p in percepts]))
 
     def frame_of(self, percept: Percept) -> NDArray[np.float64]:
-        """The frame of an object's crop in the image, once round [5, 2], pixels."""
+        """The frame of a percept's crop in the image: its corners [5, 2] in pixels, the first one repeated."""
         return ring_of(self.window([percept]), percept.intrinsics_px, percept.world_from_camera[2, :3])
 
     def crops(self, frame: Frame, percepts: list[Percept]) -> Image:
-        """What the networks look at [K, 64, 64, 3]; black beyond the image."""
+        """The crops that the networks see [K, 64, 64, 3], for K percepts. They are black outside the image."""
         up = frame.world_from_camera[2, :3]
         pixels = self.window(percepts).pixels_of(CROP_PX, frame.intrinsics_px, up)
         column, row = np.floor(pixels).astype(np.int64).transpose(3, 0, 1, 2)
@@ -56,11 +63,14 @@ class Imagination:
         return np.where(inside[..., None], frame.rgb[row.clip(0, height - 1), column.clip(0, width - 1)], np.uint8(0))
 
     def reconstructions(self, percepts: list[Percept]) -> Image:
-        """What they make of it: the latent poses' means, drawn [K, 64, 64, 3]."""
+        """The reconstructions [K, 64, 64, 3] of K percepts: the means of their latent poses, decoded."""
         return self._draw({p.object: p.latent_mean for p in percepts})
 
     def planned_view(self, viewpoint: NDArray[np.float64], beliefs: list[Belief], seen: dict[str, Percept]) -> Image:
-        """How these objects would look from `viewpoint` [4, 4], by the percepts that saw them last; [240, 240, 3]."""
+        """How the objects of these beliefs would look from `viewpoint` [4, 4]: an image [240, 240, 3].
+
+        `seen` holds, for each object, the last percept that saw it. An object without one is left out.
+        """
         view = np.zeros((VIEW_PX, VIEW_PX, 3), np.uint8)
         scale = VIEW_PX / IMAGE_SIZE_PX
         intrinsics = np.array(INTRINSICS_PX) * scale
@@ -76,7 +86,7 @@ class Imagination:
             (left, top), (right, bottom) = np.floor(ring.min(0)).astype(int), np.ceil(ring.max(0)).astype(int)
             grid = np.stack(np.meshgrid(np.arange(left, right), np.arange(top, bottom)), axis=-1)
             at = window.crop_of(grid.reshape(-1, 2) + 0.5, intrinsics, viewpoint[2, :3])[0].reshape(grid.shape)
-            inside = (np.abs(at) < 1).all(axis=-1)  # what is nowhere is not inside
+            inside = (np.abs(at) < 1).all(axis=-1)  # false for NaN, which means behind the crop's camera
             column, row = (np.where(inside[..., None], at + 1, 0) / 2 * CROP_PX).astype(np.int64).transpose(2, 0, 1)
             drawn = crop[row, column]
             shown = inside & (drawn.max(axis=-1) > DARK)
@@ -84,7 +94,7 @@ class Imagination:
         return view
 
     def _moved(self, viewpoint: NDArray[np.float64], belief: Belief, seen: Percept) -> NDArray[np.float32]:
-        """The latent pose as seen from there."""
+        """The latent pose of the percept `seen`, moved to the viewpoint [L]."""
         azimuth, elevation, _ = spherical(np.stack([seen.world_from_camera[:3, 3], viewpoint[:3, 3]]), belief.mean_m)
         moved = np.array([[wrap(azimuth[1] - azimuth[0]), elevation[1] - elevation[0]]])
         return self._transitions[belief.object](seen.latent_mean, moved)[0][0]

@@ -1,4 +1,4 @@
-"""The viewer on the bus: an onlooker. Nobody waits for it, and what it cannot keep up with it leaves out."""
+"""The viewer of a live run. It only listens: no service waits for it, and it drops messages if it is too slow."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from saccade.shared.loop.process import Health, Heartbeat, Inbox, run_process
 NAME = "viewer"
 QUEUE_BYTES = 64 * 1024 * 1024  # of messages that wait to be shown; what does not fit is dropped and counted
 TICK_S = 0.5
-WAITED_FOR = 10_000  # messages that may still come out of their turn
-BATCH_S = 0.5  # of what is sent to browsers: each batch costs them a drawing
+WAITED_FOR = 10_000  # how many missing messages are remembered because they may still come late
+BATCH_S = 0.5  # time between two batches for the browsers, which draw everything again for each batch
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """The viewer's process."""
+    """Runs the viewer's process."""
     run_process(NAME, _work, inbox=Inbox(QUEUE_BYTES), argv=argv)
 
 
@@ -44,9 +44,11 @@ def _work(config: Config, folder: Path, inbox: Inbox) -> None:
 
 
 def watch(bus: Bus, server: Server, config: Config, inbox: Inbox, health: Health) -> list[str]:
-    """Shows a run from its start, as far as its services still know it, until the inbox is stopped; what could not be
-    shown, in words. `health` counts, and names the run, or not: then it is the one that goes on. Raises SaccadeError if
-    the server ends."""
+    """Shows a run until the inbox is stopped. Returns texts that say what could not be shown.
+
+    It begins with the start of the run, as far as the services still have its messages. `health` counts messages and
+    names the run; if it names none, the run that is going on is shown. Raises SaccadeError if the server ends.
+    """
     bus.subscribe(SHOWN, inbox.put)
     run = health.at[0]
     past = bus.recall([topic for topic in SHOWN if topic != STATUS], (run, 0, 0) if run else None, KEPT_BYTES)
@@ -59,7 +61,7 @@ def watch(bus: Bus, server: Server, config: Config, inbox: Inbox, health: Health
         health.say(state="ready", note=server.url)
         for kept in sorted(past, key=lambda kept: kept.published_ns):
             feed.take(kept.topic, kept.part, kept.payload)
-        past.clear()  # it may be hundreds of megabytes
+        past.clear()  # frees the memory, which may be hundreds of megabytes
         for item in inbox.items(tick_s=TICK_S):
             if not server.running:
                 raise SaccadeError("viewer: Rerun's server has ended")
@@ -70,7 +72,7 @@ def watch(bus: Bus, server: Server, config: Config, inbox: Inbox, health: Health
 
 @contextmanager
 def connected(recording: rr.RecordingStream, server: Server) -> Iterator[None]:
-    """Within it, what is logged goes to the server."""
+    """A context in which the recording is sent to the server."""
     recording.connect_grpc(server.data_url)
     try:
         yield
@@ -79,7 +81,7 @@ def connected(recording: rr.RecordingStream, server: Server) -> Iterator[None]:
 
 
 class _Feed:
-    """Each message once, the valid ones."""
+    """Passes each valid message to the viewer, once."""
 
     def __init__(self, viewer: Viewer, health: Health) -> None:
         self.viewer, self._health = viewer, health
@@ -87,7 +89,7 @@ class _Feed:
 
     def take(self, topic: Topic, part: str | None, payload: bytes) -> None:
         self._health.received += 1
-        with suppress(MessageError):  # whoever works with it counts it
+        with suppress(MessageError):  # the services that compute with the message count it as refused
             message = decode(topic.type, payload)
             lost = self._sequences.take(topic, part, message)
             if lost is None:
@@ -98,7 +100,7 @@ class _Feed:
             self._health.at = (message.run, message.episode, message.step)
 
     def _note_lost(self, lost: int) -> None:
-        """So many did not come in their turn: they came faster than this process could take them."""
+        """Counts messages that did not come in order: they came faster than this process could take them."""
         self._health.gaps += lost
         self.viewer.dropped(self._health.gaps)
         if sum(self._sequences.missing.values()) > WAITED_FOR:

@@ -1,6 +1,7 @@
-"""Rerun's server with its web viewer: keeps what was logged for browsers that come later, within a bound.
+"""Rerun's server with its web viewer. It keeps the recording for browsers that connect later, up to a memory limit.
 
-Two ports: the page, which comes through a door of ours, and the data. Rerun's usage analytics are off.
+It has two ports: one for the page, which passes through our own small web server (`door.py`), and one for the data.
+Rerun's usage analytics are switched off.
 """
 
 from __future__ import annotations
@@ -25,14 +26,16 @@ from saccade.shared.config import Config, ViewerConfig
 from saccade.shared.errors import SaccadeError
 
 LOOPBACK = "127.0.0.1"
-START_S, STOP_S = 20.0, 5.0
-PORTS = 100  # that are tried, from the wished one on
-PR_SET_PDEATHSIG = 1
+START_S, STOP_S = 20.0, 5.0  # how long to wait for the server to start and to stop
+PORTS = 100  # how many ports are tried, from the requested one on
+PR_SET_PDEATHSIG = 1  # Linux: the signal that a process gets when its parent dies
 
 
 class Server:
-    """Rerun's server as a child process, and the door before its page, at `url`. Raises SaccadeError where it cannot be
-    started: Rerun is not installed, a port is taken."""
+    """Rerun's server as a child process, and the web server in front of its page, at `url`.
+
+    Raises SaccadeError if it cannot be started, for example because Rerun is not installed or a port is in use.
+    """
 
     def __init__(self, config: ViewerConfig) -> None:
         self._home = tempfile.TemporaryDirectory(prefix="saccade-viewer-", ignore_cleanup_errors=True)
@@ -45,12 +48,12 @@ class Server:
 
     @property
     def data_url(self) -> str:
-        """Where a recording is logged to."""
+        """The address to which a recording is sent."""
         return f"rerun+http://{here(self.address)}:{self.data_port}/proxy"
 
     @property
     def running(self) -> bool:
-        """Whether the child still runs."""
+        """Whether the child process still runs."""
         return self._child.poll() is None
 
     def __enter__(self) -> Server:
@@ -89,7 +92,7 @@ class Server:
         return child
 
     def _environment(self) -> dict[str, str]:
-        """A home of its own, in which analytics are off."""
+        """The environment of the child process, with a home folder of its own in which analytics are off."""
         kept = {name: value for name, value in os.environ.items() if not name.startswith("XDG_")}
         environment = {**kept, "HOME": self._home.name, "RUST_LOG": "warn", "NO_COLOR": "1"}
         subprocess.run([binary(), "analytics", "disable"], env=environment, capture_output=True, check=True)
@@ -97,13 +100,15 @@ class Server:
 
 
 def url_of(config: ViewerConfig) -> str:
-    """What a person types."""
+    """The address that a user types into a browser."""
     return f"http://{'localhost' if config.address in ('0.0.0.0', '::') else config.address}:{config.port}"
 
 
 def with_free_ports(config: Config) -> Config:
-    """The configuration with the ports that a viewer will have: its own, or the next that is free. Raises SaccadeError
-    where none is."""
+    """The configuration with free ports for a viewer: the configured ones, or the next that are free.
+
+    Raises SaccadeError if no port is free.
+    """
     viewer = config.viewer
     port = free_port(viewer.address, viewer.port, but=(viewer.data_port,))
     return config.with_values({"viewer.port": port,
@@ -111,7 +116,7 @@ def with_free_ports(config: Config) -> Config:
 
 
 def binary() -> str:
-    """Rerun's program. Raises SaccadeError where it is not installed."""
+    """The path of Rerun's program. Raises SaccadeError if it is not installed."""
     spec = find_spec("rerun_cli")
     folder = Path(spec.origin).parent if spec and spec.origin else None
     path = folder / ("rerun.exe" if sys.platform == "win32" else "rerun") if folder else None
@@ -121,9 +126,11 @@ def binary() -> str:
 
 
 def free_port(address: str, first: int | None = None, *, but: Collection[int] = ()) -> int:
-    """A port that is free now and none of `but`; with `first` that one, or the next after it. Raises SaccadeError where
-    there is none."""
-    reason = "others have them"
+    """A port that is free now and not one of `but`. With `first` it is this port or the next free one after it.
+
+    Raises SaccadeError if no port is free.
+    """
+    reason = "they are in use"
     for port in [0] * PORTS if first is None else range(first, min(first + PORTS, 65536)):
         try:
             with socket.socket(socket.AF_INET6 if ":" in address else socket.AF_INET) as probe:
@@ -137,12 +144,12 @@ def free_port(address: str, first: int | None = None, *, but: Collection[int] = 
 
 
 def here(address: str) -> str:
-    """The address by which this machine reaches what is bound to `address`."""
+    """The address at which this machine reaches a server that is bound to `address`."""
     return {"0.0.0.0": LOOPBACK, "::": "::1"}.get(address, address)
 
 
 def listens(address: str, port: int) -> bool:
-    """Whether somebody listens there."""
+    """Whether a server listens at this port."""
     try:
         with socket.create_connection((here(address), port), timeout=1.0):
             return True
@@ -151,8 +158,11 @@ def listens(address: str, port: int) -> bool:
 
 
 def _as_child() -> Callable[[], None] | None:
-    """On Linux: a parent that is killed takes the server with it, and its ports are free again; the server's session
-    comes last."""
+    """A function that the child process runs before it starts the server; None if this is not Linux.
+
+    With it the server ends when its parent is killed, so that its ports are free again, and the server's session gets
+    the lowest priority.
+    """
     if sys.platform != "linux":
         return None
     prctl = ctypes.CDLL(None).prctl

@@ -6,31 +6,31 @@ from collections.abc import Iterable
 
 from saccade.shared.bus.messages import Belief, Plan, Result
 
-SEEN = 0.5  # presence from which on an object counts as seen
-NEAR_M = 0.10  # from here on the camera turns as planned
+SEEN = 0.5  # an object with at least this presence counts as seen
+NEAR_M = 0.10  # nearer than this to the goal's viewpoint the camera turns as planned
 
 
 def decision(plan: Plan, beliefs: Iterable[Belief]) -> str:
-    """What a plan is about."""
+    """What the agent has decided, in words."""
     if plan.arrived:
-        return "there"
+        return "arrived at the goal's view"
     if plan.mode == "search":
         unseen = sorted(plain(belief.object) for belief in beliefs if belief.presence < SEEN)
-        what = f"{', '.join(unseen)} unseen" if unseen else "all are seen, where they are is not sure"
+        what = f"{', '.join(unseen)} unseen" if unseen else "all are seen, but their positions are uncertain"
         return f"look for the {plain(plan.target)}: {what}" if plan.target else f"explore: {what}"
     if plan.mode == "approach":
-        return f"approach the {plain(plan.target)}: from where it looks like the goal is not known"
+        return f"approach the {plain(plan.target)}: the goal's viewpoint is not known yet"
     if 0 <= plan.believed_distance_m < NEAR_M:
         return f"centre the {plain(plan.target)} as in the goal"
     return f"approach: the goal's view of the {plain(plan.target)}"
 
 
 def ending(result: Result) -> str:
-    """How an episode ended."""
+    """How an episode ended, in words."""
     how = "reached the goal" if result.success else "did not reach the goal"
     return f"{result.scene}: {how} in {result.steps} steps"
 
 
 def plain(name: str) -> str:
-    """An object's name as one says it: `005_tomato_soup_can` is a tomato soup can."""
+    """An object's name in plain words: `005_tomato_soup_can` becomes `tomato soup can`."""
     return name.lstrip("0123456789_").replace("_", " ") or name

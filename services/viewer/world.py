@@ -1,4 +1,4 @@
-"""The table in three dimensions: camera and path, particles and beliefs, candidates, the chosen viewpoint, ghosts."""
+"""The table in three dimensions: the camera and its path, particles, beliefs, candidates and the chosen viewpoint."""
 
 from __future__ import annotations
 
@@ -17,44 +17,46 @@ from saccade.shared.world.geometry import IMAGE_SIZE_PX, INTRINSICS_PX
 from saccade.shared.world.task import LOWER_M, UPPER_M
 
 CAMERA, VIEWPOINT, GOAL, TRUTH = "world/camera", "world/viewpoint", "world/goal", "world/true"
-OF_EPISODE = ("world/objects", "world/path", "world/candidates", VIEWPOINT, GOAL, TRUTH)  # cleared with the next
-FRUSTUM_M, PLANNED_M, GHOST_M = 0.10, 0.07, 0.04
-PATH_LENGTH = 500  # positions: what is drawn anew at every step must not grow with the run
-CHI_95 = 2.80  # a Gaussian in space is within so many deviations with probability 0.95
+OF_EPISODE = ("world/objects", "world/path", "world/candidates", VIEWPOINT, GOAL, TRUTH)  # cleared in the next episode
+FRUSTUM_M, PLANNED_M, GHOST_M = 0.10, 0.07, 0.04  # size of the cameras, and half size of an object of unknown size
+PATH_LENGTH = 500  # positions of the path that are shown: it is drawn at every step and must not grow with the run
+CHI_95 = 2.80  # a Gaussian in space is within this many standard deviations with probability 0.95
 PARTICLE_M, CANDIDATE_M = 0.0025, 0.006
-UNSEEN_GREY = 110  # towards which the particles of what is believed absent fade
+UNSEEN_GREY = 110  # particles of an object that is believed absent fade towards this grey
 
 
 class World:
-    """Logs to `world/`. `colour_of(name)`: an object's; `sizes_m`: boxes of the objects [3], as far as they are
-    known."""
+    """Logs to `world/`.
+
+    `colour_of(name)` gives the colour of an object. `sizes_m` holds the extents [3] of the known objects' boxes.
+    """
 
     def __init__(self, recording: rr.RecordingStream, colour_of: Callable[[str], Colour],
                  sizes_m: dict[str, NDArray[np.float64]]) -> None:
         self._to, self._colour_of, self._sizes_m = recording, colour_of, sizes_m
         self._path: deque[NDArray[np.float64]] = deque(maxlen=PATH_LENGTH)
-        self._looks: dict[str, object] = {}  # of each path, what is logged only when it changes
+        self._looks: dict[str, object] = {}  # by path: properties that are logged only when they change
         self._to.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         side = (UPPER_M - LOWER_M)[:2]
         self._to.log("world/table", rr.Boxes3D(centers=[(0, 0, -0.006)], sizes=[(*side, 0.01)], colors=[TABLE],
                                                fill_mode="solid"), static=True)
 
     def begin(self) -> None:
-        """Another episode: nothing is there yet."""
+        """Starts another episode: removes what belongs to the last one."""
         self._path.clear()
         self._looks.clear()
         for path in OF_EPISODE:
             self._to.log(path, rr.Clear(recursive=True))
 
     def frame(self, frame: Frame) -> None:
-        """Where the camera is, and has been."""
+        """Logs the camera and its path."""
         height, width = frame.rgb.shape[:2]
         self._camera(CAMERA, frame.world_from_camera, frame.intrinsics_px, (width, height), FRUSTUM_M, PATH)
         self._path.append(frame.world_from_camera[:3, 3])
         self._to.log("world/path", rr.LineStrips3D([np.array(self._path)], colors=[PATH], radii=[0.0015]))
 
     def belief(self, belief: Belief) -> None:
-        """Particles; within the ellipsoid the object is with probability 0.95."""
+        """Logs the particles of an object, and the ellipsoid that contains it with probability 0.95."""
         path, colour = f"world/objects/{rr.escape_entity_path_part(belief.object)}", self._colour_of(belief.object)
         share = 0.2 + 0.8 * round(8 * belief.presence) / 8
         faded = [round(UNSEEN_GREY + (part - UNSEEN_GREY) * share) for part in colour]
@@ -78,7 +80,7 @@ class World:
             quaternions=[rr.Quaternion(xyzw=quaternion(vectors))], **look))
 
     def plan(self, plan: Plan) -> None:
-        """The best candidates, the best one green, and the chosen viewpoint, with the image that is imagined there."""
+        """Logs the best candidates (the very best is green), and the chosen viewpoint as a camera."""
         imagined_px = np.array(INTRINSICS_PX) * (VIEW_PX / IMAGE_SIZE_PX)
         self._camera(VIEWPOINT, plan.viewpoint, imagined_px, (VIEW_PX,) * 2, PLANNED_M, PLANNED)
         if plan.best_eyes_m is not None and plan.best_g is not None:
@@ -88,7 +90,7 @@ class World:
                 plan.best_eyes_m, colors=[between(float(share)) for share in shares], radii=CANDIDATE_M))
 
     def truth(self, truth: Truth) -> None:
-        """What the simulator alone knows: the goal's camera, and the objects as ghosts."""
+        """Logs what only the simulator knows: the camera at the goal, and the objects as transparent boxes."""
         self._camera(GOAL, truth.goal_world_from_camera, INTRINSICS_PX, (IMAGE_SIZE_PX,) * 2, FRUSTUM_M, TRUE)
         half = np.zeros((len(truth.names), 3)) + GHOST_M
         for k, name in enumerate(truth.names):
@@ -112,7 +114,7 @@ class World:
 
 
 def quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Of a rotation matrix [3, 3], as (x, y, z, w): the leading eigenvector of Bar-Itzhack's matrix (2000)."""
+    """The quaternion (x, y, z, w) of a rotation [3, 3]: the leading eigenvector of Bar-Itzhack's matrix (2000)."""
     (a, b, c), (d, e, f), (g, h, i) = rotation
     k = np.array([[a - e - i, d + b, g + c, h - f], [d + b, e - a - i, h + f, c - g],
                   [g + c, h + f, i - a - e, d - b], [h - f, c - g, d - b, a + e + i]]) / 3
