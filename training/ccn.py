@@ -1,5 +1,7 @@
-"""Phase 1: the CCN of one object with loss L1 under GECO constraints (paper, section 3.2, table 8), and its identity
-network on the same crops."""
+"""Phase 1: trains the CCN and the identity network of one object on the same crops.
+
+The CCN has the loss L1 with GECO constraints (paper, section 3.2, table 8).
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,7 @@ from saccade.services.perception.networks import Identity
 from saccade.shared.model.generative_model import CCN, kl_divergence, log_density
 from saccade.training.crops import CropBatch, CropComposer
 
-TOLERANCE = 40.0  # GECO: squared error summed over a crop that is good enough
+TOLERANCE = 40.0  # GECO: the squared error, summed over a crop, that is accepted
 LAMBDA_RANGE = (80.0, 100.0)
 LAMBDA_FACTOR, LAMBDA_EVERY = 1.01, 500
 KL_TRANSITION, KL_PRIOR = 50.0, 1.0
@@ -22,7 +24,7 @@ KL_TRANSITION, KL_PRIOR = 50.0, 1.0
 
 @dataclass(frozen=True)
 class Pair:
-    """Two views of the same object and the displacement [B, 2] (azimuth, elevation; radians) from first to second."""
+    """Pairs of views of one object, with the displacement [B, 2] (azimuth, elevation; radians) from first to second."""
 
     first: CropBatch
     second: CropBatch
@@ -30,13 +32,13 @@ class Pair:
 
 
 def wrapped(angle: Tensor) -> Tensor:
-    """Angles in [-pi, pi): the only ones that the paper's transition has seen."""
+    """Brings angles (radians) into [-pi, pi). The paper's transition is trained on no others."""
     return torch.remainder(angle + torch.pi, 2 * torch.pi) - torch.pi
 
 
 def sample_pair(composer: CropComposer, train_index: Tensor, batch: int, generator: torch.Generator, *,
                 clean: bool = False) -> Pair:
-    """Random pairs of the training directions, composed; or `clean`, as they were rendered."""
+    """Draws `batch` random pairs of the directions `train_index`: composed with clutter, or `clean` as rendered."""
     def pick() -> Tensor:
         chosen = torch.randint(len(train_index), (batch,), generator=generator, device=composer.device)
         return train_index[chosen]
@@ -50,17 +52,21 @@ def sample_pair(composer: CropComposer, train_index: Tensor, batch: int, generat
 
 
 def squared_error(image: Tensor, target: Tensor, weight: Tensor) -> Tensor:
-    """Squared error summed over each crop, weighted mean over the batch. The sum matters: with the mean the KL wins."""
+    """Squared error of images [B, C, H, W], summed over each crop and averaged over the batch with weights [B].
+
+    The sum over the crop is necessary: with a mean the KL terms would outweigh the error.
+    """
     per_crop = ((image.float() - target) ** 2).sum((1, 2, 3))
     return (per_crop * weight).sum() / weight.sum().clamp(min=1.0)
 
 
 def loss_l1(ccn: CCN, pair: Pair, lambdas: list[float], generator: torch.Generator, *,
             kl_transition: float = KL_TRANSITION, halves: bool = True) -> tuple[Tensor, dict[str, float]]:
-    """Loss L1 (equation 4), with o_2 compared to a decoding of its own latent (the paper's o_1 there is a slip).
+    """The loss L1 (paper, equation 4) and its parts.
 
-    `halves`: in the terms before the transition half of the batch stands for o_1 and half for o_2; as the pairs are
-    symmetric, that saves a third of the decodings.
+    o_2 is compared with the decoding of its own latent pose; the paper writes o_1 there by mistake. With `halves` the
+    two terms before the transition use half of the batch each: one half for o_1, the other half for o_2. The pairs are
+    symmetric, so this saves a third of the decodings.
     """
     both = torch.cat([pair.first.masked, pair.second.masked]).contiguous(memory_format=torch.channels_last)
     mean, std = ccn.encoder(both)
@@ -85,13 +91,17 @@ def loss_l1(ccn: CCN, pair: Pair, lambdas: list[float], generator: torch.Generat
 
 
 def adapt(lambdas: list[float], errors: list[float]) -> list[float]:
-    """GECO: raises the weight of a constraint that is violated and lowers the others, within the paper's range."""
+    """GECO: raises the weights of constraints that are violated and lowers the others, within the paper's range."""
     return [float(np.clip(w * LAMBDA_FACTOR if e > TOLERANCE else w / LAMBDA_FACTOR, *LAMBDA_RANGE))
             for w, e in zip(lambdas, errors, strict=True)]
 
 
 def identity_loss(identity: Identity, batch: CropBatch) -> Tensor:
-    """Presence (binary cross entropy), and the correction's Gaussian negative log likelihood where it is seen."""
+    """The loss of the identity network.
+
+    It is the binary cross entropy of the presence, plus the Gaussian negative log likelihood of the correction for the
+    crops in which the object is seen.
+    """
     logit, correction, log_std = identity(batch.raw.contiguous(memory_format=torch.channels_last))
     label = (batch.present & (batch.visible > 0.15)).float()
     clear = ((~batch.present) | (batch.visible > 0.3) | (batch.visible < 0.05)).float()
@@ -104,8 +114,11 @@ def identity_loss(identity: Identity, batch: CropBatch) -> Tensor:
 @torch.inference_mode()
 def goal_search_errors(ccn: CCN, composer: CropComposer, held_out: Tensor, generator: torch.Generator, *,
                        pairs: int = 150, jitter: float = 1.0) -> np.ndarray:
-    """Great-circle errors [pairs] (radians) of the goal direction that the transitioned latent finds for held-out
-    pairs of composed crops, on a grid of 5 degrees."""
+    """Errors [pairs] (great circle, radians) of the goal direction that the CCN finds, for held-out directions.
+
+    For each pair of composed crops, the transition moves the latent pose of the first crop to every cell of a grid of
+    5 degrees. The cell under which the latent pose of the second crop is likeliest is the direction that was found.
+    """
     def pick() -> Tensor:
         return held_out[torch.randint(len(held_out), (pairs,), generator=generator, device=composer.device)]
 

@@ -1,4 +1,4 @@
-"""Reading what a part of a training run has left."""
+"""Reads the checkpoints of a training run. A part of a run is what one process trains."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ CHECKPOINT = "checkpoint.safetensors"
 
 
 def read_checkpoint(path: Path) -> tuple[dict, dict[str, Tensor]]:
-    """Facts and tensors of a checkpoint. Raises SaccadeError where it is damaged."""
+    """The facts (such as the step) and the tensors of a checkpoint. Raises SaccadeError if it is damaged."""
     try:
         with safe_open(path, "pt") as file:
             facts = json.loads(file.metadata()["facts"])
@@ -27,12 +27,12 @@ def read_checkpoint(path: Path) -> tuple[dict, dict[str, Tensor]]:
 
 
 def model_of(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The module's tensors in a checkpoint, without the optimiser's."""
+    """The tensors of the networks in a checkpoint, without those of the optimiser."""
     return {k.removeprefix("model."): v for k, v in tensors.items() if k.startswith("model.")}
 
 
 def finished(run_dir: Path, config: TrainingConfig, part: str) -> tuple[dict, dict[str, Tensor]]:
-    """Facts and the module's tensors of a finished part. Raises SaccadeError where it is not finished."""
+    """The facts and the networks' tensors of a finished part. Raises SaccadeError if the part is not finished."""
     path = run_dir / part / CHECKPOINT
     if not path.is_file():
         raise SaccadeError(f"{path} is missing: that part is not trained yet")
@@ -43,8 +43,10 @@ def finished(run_dir: Path, config: TrainingConfig, part: str) -> tuple[dict, di
 
 
 def ccn_of(run_dir: Path, config: TrainingConfig, name: str) -> tuple[dict, dict[str, Tensor]]:
-    """What the manifest says of an object's finished CCN, and its tensors: of this run, or of the weights that
-    `config.ccns` names. Raises SaccadeError where there is none."""
+    """The facts and the tensors of an object's finished CCN, from this run or from the weights in `config.ccns`.
+
+    Raises SaccadeError if there is no such CCN, or if the weights have another architecture.
+    """
     if config.ccns is None:
         return finished(run_dir, config, name)
     weights = Weights(Path(config.ccns))

@@ -1,7 +1,7 @@
-"""Crops for the CCN and the identity network: one object's view as the detector would cut it out, and the clean one.
+"""Crops for training the CCN and the identity network: a view as the detector would cut it out, and the clean view.
 
-Scale, shift and roll are as wrong as the detector's own; other objects stand behind or in front; background, light and
-the mask vary. The targets stay clean, so the networks learn to see through all that.
+Scale, shift and roll are as wrong as the detector's. Other objects stand behind the object or in front of it. The
+background, the light and the mask vary. The targets are clean, so the networks learn to ignore these disturbances.
 """
 
 from __future__ import annotations
@@ -17,15 +17,16 @@ from saccade.services.simulator.views import ObjectViews
 from saccade.shared.world.windows import CROP_PX
 from saccade.training.strangers import strangers
 
-REFERENCE_SHELL = 2  # index of the paper's 0.40 m among the shells
+REFERENCE_SHELL = 2  # index of the paper's range of 0.40 m among the ranges of the views
 
 
 @dataclass(frozen=True)
 class CropBatch:
     """B composed crops of one object.
 
-    rgb [B, 3, 64, 64], mask [B, 1, 64, 64] as a detector would give it, present [B] bool, visible [B] share of the
-    object not hidden, correction [B, 3] (du, dv in crop sides, log scale ratio), target [B, 3, 64, 64] clean view.
+    rgb [B, 3, 64, 64]; mask [B, 1, 64, 64] as the detector would give it; present [B] bool; visible [B], the share of
+    the object that is not hidden; correction [B, 3] (du, dv in crop sides, log of the scale's ratio); target
+    [B, 3, 64, 64], the clean view.
     """
 
     rgb: Tensor
@@ -37,18 +38,20 @@ class CropBatch:
 
     @property
     def masked(self) -> Tensor:
-        """What the CCN sees [B, 4, 64, 64]: the masked crop and its mask (o * alpha, paper section 3.2)."""
+        """The input of the CCN [B, 4, 64, 64]: the masked crop and its mask (o * alpha, paper, section 3.2)."""
         return torch.cat([self.rgb * self.mask, self.mask], dim=1)
 
     @property
     def raw(self) -> Tensor:
-        """What the identity network sees [B, 4, 64, 64]."""
+        """The input of the identity network [B, 4, 64, 64]: the crop and its mask."""
         return torch.cat([self.rgb, self.mask], dim=1)
 
 
 class CropComposer:
-    """Composes crops of `views` with `others` and strangers as clutter, the strangers drawn once from `seed`. All other
-    randomness comes from the generator of each call."""
+    """Composes crops of the object `views`, with the `others` and strangers as clutter.
+
+    The strangers are drawn once, from `seed`. All other randomness comes from the generator of each call.
+    """
 
     def __init__(self, views: ObjectViews, others: list[ObjectViews], device: torch.device, seed: int = 0):
         self.views, self.device = views, device
@@ -59,11 +62,11 @@ class CropComposer:
         self.elevation = torch.as_tensor(views.elevation_rad, dtype=torch.float32, device=device)
 
     def clean(self, index: Tensor) -> Tensor:
-        """Clean views [B, 3, 64, 64] at the reference range."""
+        """Clean views [B, 3, 64, 64] of the directions `index` [B], at the reference range."""
         return self.tiles[0][REFERENCE_SHELL, index, :3].float() / 255.0
 
     def undisturbed(self, index: Tensor) -> CropBatch:
-        """The directions `index` [B] as they were rendered from the reference range, alone and whole."""
+        """Crops of the directions `index` [B] as they were rendered at the reference range, with nothing changed."""
         tile = self.tiles[0][REFERENCE_SHELL, index].float() / 255.0
         whole = torch.ones(len(index), device=self.device)
         return CropBatch(tile[:, :3], tile[:, 3:], whole.bool(), whole, torch.zeros(len(index), 3, device=self.device),
@@ -71,7 +74,10 @@ class CropComposer:
 
     def compose(self, index: Tensor, generator: torch.Generator, *, present: float = 1.0,
                 jitter: float = 1.0) -> CropBatch:
-        """Crops of the directions `index` [B]; with probability 1 - `present` the object is not there."""
+        """Composes crops of the directions `index` [B].
+
+        The object is in a crop with probability `present`. `jitter` scales the errors of scale, shift and roll.
+        """
         def uniform(*shape: int) -> Tensor:
             return torch.rand(*shape, generator=generator, device=self.device)
 
@@ -100,13 +106,16 @@ class CropComposer:
         return CropBatch(rgb, _detector_mask(alpha, uniform), there, visible, correction, self.clean(index))
 
     def _tiles_of(self, which: int, index: Tensor, uniform) -> Tensor:
+        """Tiles [B, 4, 64, 64] of object `which`, in the directions `index` [B] and from random ranges."""
         shells = self.tiles[which].shape[0]
         shell = (uniform(len(index)) * shells).long()
         return self.tiles[which][shell, index].float() / 255.0
 
     def _clutter(self, count: int, uniform, *, near: Tensor, rare: bool) -> Tensor:
-        """Another object's view [B, 4, 64, 64] somewhere in the crop, or nothing; near the centre where `near`. A
-        stranger is twice as frequent as any other object."""
+        """Layers [B, 4, 64, 64] with another object somewhere in the crop, or with nothing.
+
+        The object is near the centre where `near` [B] is true. A stranger is twice as frequent as each other object.
+        """
         which = (uniform(count) * len(self.tiles)).long().add(1).clamp(max=len(self.tiles) - 1)
         result = torch.zeros(count, 4, CROP_PX, CROP_PX, device=self.device)
         offset = (uniform(count, 2) * 2 - 1) * torch.where(near, 0.25, 1.5)[:, None]
@@ -131,7 +140,10 @@ def _half_tiles(views: ObjectViews) -> Tensor:
 
 
 def warp(tiles: Tensor, center: Tensor, scale: Tensor, roll: Tensor, side_px: int = CROP_PX) -> Tensor:
-    """Tiles [B, C, h, w] drawn on a crop: centre [B, 2] in half crop sides, scale [B] in crop sides, roll [B]."""
+    """Draws tiles [B, C, h, w] on crops [B, C, side_px, side_px].
+
+    The centre [B, 2] is in half crop sides, the scale [B] in crop sides, the roll [B] in radians.
+    """
     cos, sin = roll.cos() / scale, roll.sin() / scale
     rows = torch.stack([torch.stack([cos, sin], -1), torch.stack([-sin, cos], -1)], dim=1)
     theta = torch.cat([rows, -rows @ center[:, :, None]], dim=2)
@@ -140,7 +152,7 @@ def warp(tiles: Tensor, center: Tensor, scale: Tensor, roll: Tensor, side_px: in
 
 
 def _background(count: int, uniform) -> Tensor:
-    """Two flat colours with a random straight border (paper, appendix B); sometimes the second is the black beyond."""
+    """Backgrounds of two flat colours with a random straight border (paper, appendix B). The second is often black."""
     axis = torch.linspace(-1, 1, CROP_PX, device=uniform(1).device)
     angle = uniform(count) * 6.2832
     side = (axis[None, None, :] * angle.cos()[:, None, None] + axis[None, :, None] * angle.sin()[:, None, None]
@@ -150,7 +162,7 @@ def _background(count: int, uniform) -> Tensor:
 
 
 def _image_border(count: int, uniform) -> Tensor:
-    """1 inside the image, 0 outside [B, 1, 64, 64]: some crops hang over its edge."""
+    """Masks [B, 1, 64, 64] that are 1 inside the image and 0 outside: some crops reach beyond the image's border."""
     axis = torch.linspace(-0.5, 0.5, CROP_PX, device=uniform(1).device)
     cut = torch.where(uniform(count) < 0.2, 0.05 + 0.45 * uniform(count), torch.full_like(uniform(count), 2.0))
     side = (uniform(count) * 4).long()
@@ -160,7 +172,7 @@ def _image_border(count: int, uniform) -> Tensor:
 
 
 def _on_some(image: Tensor, chosen: Tensor, change: Callable[[Tensor], Tensor]) -> Tensor:
-    """`change` applied to the rows `chosen` [B] bool, in place."""
+    """Applies `change` in place to the images for which `chosen` [B] is true."""
     rows = torch.nonzero(chosen).squeeze(1)
     if len(rows):
         image[rows] = change(image[rows])
@@ -177,8 +189,11 @@ def _coarsen(factor: int) -> Callable[[Tensor], Tensor]:
 
 
 def _detector_mask(alpha: Tensor, uniform) -> Tensor:
-    """The true mask as a detector gives it: coarse, too large or too small, unsure inside, with holes and false spots.
-    Trained on better masks than it will see, the identity network reads the scale off their outline and is misled."""
+    """The true mask as a detector would give it: coarse, too large or too small, uncertain, with holes and false spots.
+
+    An identity network that is trained on better masks reads the scale from their outline. With the masks of the
+    detector it is then wrong.
+    """
     count, size = len(alpha), alpha.shape[-2:]
     pick, wrong = uniform(count), uniform(count)
     mask = _on_some(alpha.clone(), pick < 0.3, _coarsen(8))

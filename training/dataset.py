@@ -1,4 +1,4 @@
-"""The views of the objects, rendered once per training run and kept in its folder."""
+"""The views of the objects. They are rendered once per training run and kept in its folder."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from saccade.training.settings import TrainingConfig
 
 
 def path_of(run_dir: Path, name: str) -> Path:
-    """Where the views of one object are kept."""
+    """The file with the views of one object."""
     return run_dir / "views" / f"{name}.npz"
 
 
 def render_missing(run_dir: Path, config: TrainingConfig, progress: Callable[[str, int, int], None]) -> None:
-    """Renders what is not there yet; `progress` hears (object, views done, views in all)."""
+    """Renders the views that do not exist yet. `progress` is called with (object, views done, number of views)."""
     for name in config.names:
         path = path_of(run_dir, name)
         if path.is_file():
@@ -42,7 +42,7 @@ def render_missing(run_dir: Path, config: TrainingConfig, progress: Callable[[st
 
 
 def load_views(run_dir: Path, name: str) -> ObjectViews:
-    """Reads the views of one object. Raises SaccadeError where they are missing or damaged."""
+    """Reads the views of one object. Raises SaccadeError if they are missing or damaged."""
     path = path_of(run_dir, name)
     try:
         with np.load(path, allow_pickle=False) as file:

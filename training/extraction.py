@@ -1,4 +1,7 @@
-"""Phase 2: the extraction network with loss L2 (paper, equation 5 and appendix B): mask, centre, scale, presence."""
+"""Phase 2: trains the extraction network with the loss L2 (paper, equation 5 and appendix B).
+
+The network gives masks, centres, scales and presence.
+"""
 
 from __future__ import annotations
 
@@ -10,11 +13,13 @@ from torch import Tensor
 from saccade.services.perception.networks import CELLS, Extraction, tally
 from saccade.training.frames import FrameBatch
 
-SEEN, HIDDEN = 0.2, 0.04  # shares: above the first an object is present, below the second absent, between no label
+# An object counts as present if more than SEEN of it is visible, and as absent if less than HIDDEN is. Between the two
+# it has no label.
+SEEN, HIDDEN = 0.2, 0.04
 
 
 def loss_l2(network: Extraction, batch: FrameBatch) -> tuple[Tensor, dict[str, float]]:
-    """The masking error, the error of where and how large (which makes the crop), and the identification error."""
+    """The loss L2 and its parts: errors of the masks, of centre and scale (which define the crop), and of presence."""
     masks, vote_logits, votes = network(batch.image.contiguous(memory_format=torch.channels_last))
     cells = F.avg_pool2d(batch.mask, batch.mask.shape[-1] // CELLS)
     masking = F.binary_cross_entropy_with_logits(masks, batch.mask)
@@ -38,13 +43,16 @@ def loss_l2(network: Extraction, batch: FrameBatch) -> tuple[Tensor, dict[str, f
 
 @torch.inference_mode()
 def extraction_errors(network: Extraction, batch: FrameBatch) -> dict[str, float]:
-    """The errors of the network's votes: see `errors`."""
+    """The errors of the network on a batch, see `errors`."""
     _, vote_logits, votes = network(batch.image.contiguous(memory_format=torch.channels_last))
     return errors(*tally(vote_logits, votes), batch)
 
 
 def errors(presence: Tensor, center: Tensor, log_scale: Tensor, batch: FrameBatch) -> dict[str, float]:
-    """Median and 90th percentile of centre (pixels of 480) and scale (log) errors, and of presence: its accuracy."""
+    """Median and 90th percentile of the errors of centre (pixels of 480) and log scale, and two rates of presence.
+
+    The rates are the shares of visible objects (`hit`) and of hidden or absent objects (`false`) that count as present.
+    """
     seen, hidden = batch.visible > SEEN, batch.visible < HIDDEN
     pixels = 480 * (center - batch.center).norm(dim=-1)[seen].float().cpu().numpy()
     scales = (log_scale - batch.log_scale).abs()[seen].float().cpu().numpy()

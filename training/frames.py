@@ -1,7 +1,8 @@
-"""Camera images for the extraction network, composed from views of single objects (paper, appendix B).
+"""Camera images for training the extraction network, composed from views of single objects (paper, appendix B).
 
-The composition obeys geometry: a camera in the workspace, objects standing on the table, each drawn from the nearest
-rendered direction and range, warped to where it would be seen, the nearer over the farther. No scene is ever rendered.
+The images are geometrically consistent: the camera is in the workspace and the objects stand on the table. Each object
+is drawn from the view with the nearest direction and range, and warped to the place where the camera would see it.
+Nearer objects cover farther ones. No scene is rendered.
 """
 
 from __future__ import annotations
@@ -29,18 +30,20 @@ from saccade.shared.world.geometry import (
 )
 from saccade.training.strangers import strangers, texture
 
-LEVELS = 4  # of the tile pyramid: 128, 64, 32, 16 pixels
-GOAL_LIKE = 0.25  # share of images as goals show them: one object, from any elevation alike
-STRANGE_GOAL = 0.25  # share of these with an object that nobody knows,
-STRANGE = (0.65, 0.25, 0.10)  # and of the others with none, one and two of them
-TEXTURED = 0.04  # share of images with a texture instead of a table
+LEVELS = 4  # levels of the tile pyramid: 128, 64, 32 and 16 pixels
+GOAL_LIKE = 0.25  # share of images like goal images: one object, with a uniformly drawn elevation
+STRANGE_GOAL = 0.25  # share of the images like goal images that show a stranger (see strangers.py)
+STRANGE = (0.65, 0.25, 0.10)  # shares of the other images that show no, one and two strangers
+TEXTURED = 0.04  # share of images with a texture in place of the table
 
 
 @dataclass(frozen=True)
 class FrameBatch:
-    """B images of K known objects: image [B, 3, 120, 120], mask [B, K, 60, 60] (for the paper's networks: 120), centre
-    (u, v) in image widths [B, K, 2], log_scale [B, K], visible [B, K] share of the object that is seen (0 where it is
-    not there)."""
+    """B images with the labels of K known objects.
+
+    image [B, 3, 120, 120]; mask [B, K, 60, 60] (for the paper's networks [B, K, 120, 120]); center (u, v) in image
+    widths [B, K, 2]; log_scale [B, K]; visible [B, K], the share of the object that is seen (0 if it is absent).
+    """
 
     image: Tensor
     mask: Tensor
@@ -53,20 +56,22 @@ class FrameBatch:
 class _Instance:
     """One object in one image."""
 
-    scene: int
+    scene: int  # number of the image
     object: int
-    shell: int
-    index: int
-    level: int
+    shell: int  # number of the range from which the tile was rendered
+    index: int  # number of the direction
+    level: int  # of the tile pyramid
     tile_from_camera: NDArray[np.float64]  # [3, 3]: camera ray -> (tile x, tile y, 1) up to scale; tile in [-1, 1]
     range_m: float
-    pixel: NDArray[np.float64]
-    side_px: float  # of the tile in the input image
+    pixel: NDArray[np.float64]  # the centre (u, v) in image widths [2]
+    side_px: float  # side of the tile in the input image
 
 
 class FrameComposer:
-    """Composes images of the `known` objects, and of strangers that have no label, drawn once from `seed`. All other
-    randomness comes from the generators of each call."""
+    """Composes images of the `known` objects and of strangers, which have no label.
+
+    The strangers are drawn once, from `seed`. All other randomness comes from the generator of each call.
+    """
 
     def __init__(self, known: list[ObjectViews], device: torch.device, seed: int = 0):
         self.known, self.device = len(known), device
@@ -80,7 +85,7 @@ class FrameComposer:
         self.rays_t = torch.as_tensor(self.rays.reshape(-1, 3), dtype=torch.float32, device=device)
 
     def compose(self, count: int, rng: np.random.Generator) -> FrameBatch:
-        """`count` images."""
+        """Composes `count` images with their labels."""
         cameras, instances = [], []
         for scene in range(count):
             camera, placed = self._scene(rng)
@@ -90,7 +95,10 @@ class FrameComposer:
         return self._labels(count, instances, image, visible_px, mask)
 
     def _scene(self, rng: np.random.Generator):
-        """A camera pose and objects [(which, centre [3], yaw)]: as the agent meets them, and as goals show them."""
+        """Draws a camera pose [4, 4] and objects [(which, centre [3] in m, yaw in rad)].
+
+        Most scenes are like those that the agent meets, the others like those that goal images show.
+        """
         goal_like = rng.random() < GOAL_LIKE
         placed: list[tuple[int, NDArray[np.float64], float]] = []
         for which in self._chosen(goal_like, rng):
@@ -118,7 +126,10 @@ class FrameComposer:
         return camera, placed
 
     def _chosen(self, goal_like: bool, rng: np.random.Generator) -> list[int]:
-        """Which objects stand there: known ones, each once, and up to two strangers, in any order."""
+        """Draws which objects stand on the table: known ones, each at most once, and up to two strangers, shuffled.
+
+        An image like a goal image has one object.
+        """
         if goal_like:
             return [self.known if rng.random() < STRANGE_GOAL else int(rng.integers(self.known))]
         number = int(rng.integers(0 if rng.random() < 0.2 else 1, min(5, self.known) + 1))
@@ -127,6 +138,7 @@ class FrameComposer:
         return [chosen[n] for n in rng.permutation(len(chosen))]
 
     def _free_place(self, which: int, placed: list, rng: np.random.Generator) -> NDArray[np.float64]:
+        """Draws a centre [3] (m) at which an object does not overlap the others, if 20 attempts are enough."""
         size = self.views[which].size_m
         radius = np.hypot(size[0], size[1]) / 2
         for _ in range(20):
@@ -137,6 +149,7 @@ class FrameComposer:
         return np.array([*xy, size[2] / 2])
 
     def _instances(self, scene: int, camera: NDArray, placed: list) -> list[_Instance]:
+        """The objects in front of the camera with their nearest views, from far to near."""
         result = []
         for which, center, yaw in placed:
             views = self.views[which]
@@ -157,7 +170,10 @@ class FrameComposer:
         return sorted(result, key=lambda instance: -instance.range_m)
 
     def _draw(self, cameras: list, instances: list[_Instance], rng: np.random.Generator):
-        """Paints far to near. Returns images [B, 3, H, W], each instance's visible pixels and mask [60, 60]."""
+        """Draws the instances from far to near.
+
+        Returns images [B, 3, H, W] and, for each instance, the number of visible pixels and the mask [60, 60].
+        """
         image = self._backgrounds(cameras, rng)
         layers = self._warp(instances)
         alphas = [layer[3].clone() for layer in layers]
@@ -175,7 +191,7 @@ class FrameComposer:
         return image, [float(a.sum()) for a in alphas], masks
 
     def _warp(self, instances: list[_Instance]) -> list[Tensor]:
-        """Each instance's layer [4, 120, 120], rgb premultiplied by coverage."""
+        """The layer of each instance [4, 120, 120]: RGB, premultiplied by the coverage, and the coverage."""
         layers: dict[int, Tensor] = {}
         for level in range(LEVELS):
             chosen = [n for n, instance in enumerate(instances) if instance.level == level]
@@ -193,7 +209,7 @@ class FrameComposer:
         return [layers[n] for n in range(len(instances))]
 
     def _backgrounds(self, cameras: list, rng: np.random.Generator) -> Tensor:
-        """The table in one colour on black, or two colours with a random border; rarely a texture all over."""
+        """Draws backgrounds [B, 3, 120, 120]: a table in one or two colours on black, rarely a texture instead."""
         images = np.zeros((len(cameras), INPUT_PX, INPUT_PX, 3), dtype=np.float32)
         for image, camera in zip(images, cameras, strict=True):
             rays = self.rays @ camera[:3, :3].T
@@ -226,7 +242,7 @@ class FrameComposer:
 
 
 def _pyramid(views: ObjectViews, device: torch.device) -> list[Tensor]:
-    """Tiles [S, N, 4, T, T] uint8 at 128, 64, 32 and 16 pixels."""
+    """Tiles [S, N, 4, T, T] uint8 with T = 128, 64, 32 and 16 pixels."""
     levels = [torch.as_tensor(views.tiles).permute(0, 1, 4, 2, 3).contiguous()]
     for _ in range(LEVELS - 1):
         levels.append(torch.stack([F.avg_pool2d(shell.float(), 2).round().to(torch.uint8) for shell in levels[-1]]))

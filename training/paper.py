@@ -1,4 +1,7 @@
-"""Training the paper's own networks: per object loss L1, then, with its CCN frozen, loss L2 (equations 4 and 5)."""
+"""Trains the paper's own networks: for each object the CCN with the loss L1, then the others with L2 (equations 4, 5).
+
+The CCN is frozen in the second phase.
+"""
 
 from __future__ import annotations
 
@@ -20,16 +23,18 @@ from saccade.training.pictures import draw_paper_extraction
 from saccade.training.settings import TrainingConfig
 from saccade.training.tasks import CcnTask, generator_of, on_device, split
 
-KL_TRANSITION = 10.0  # lambda_4 (table of optimisation)
-MASKING, CROPPING, IDENTIFICATION = 10.0, 10.0, 10.0  # of errors summed over 64 x 64 x 3, as those of phase 1 are
+KL_TRANSITION = 10.0  # lambda_4 in the paper's table of the optimisation
+MASKING, CROPPING, IDENTIFICATION = 10.0, 10.0, 10.0  # weights of errors summed over 64 x 64 x 3, as in phase 1
 SUMMED = 3 * CROP_PX ** 2
-KL_FROM = 0.3  # of the steps: crops of nothing make for thousands of nats, and the mask learns to cut nothing out
-GUIDE_END = 0.1  # of the guide's weight is left at the end
-EVALUATED = 100  # images
+# The KL terms count after this share of the steps. Before, a crop may show nothing, which costs thousands of nats, and
+# the mask network would learn to cut nothing out.
+KL_FROM = 0.3
+GUIDE_END = 0.1  # share of the guide's weight that is left at the end
+EVALUATED = 100  # number of images in an evaluation
 
 
 class PaperCcnTask(CcnTask):
-    """Phase 1 of one object: loss L1 on clean views, every term on the whole batch."""
+    """Phase 1 for one object: the loss L1 on clean views, with every term on the whole batch."""
 
     def _composer(self, mine: ObjectViews, others: list[ObjectViews], device: torch.device):
         return CleanViews(mine, device)
@@ -45,7 +50,10 @@ class PaperCcnTask(CcnTask):
 
 
 class PaperExtractionTask:
-    """Phase 2 of one object: mask, spatial transformer and identity network with loss L2. `ccn`: the finished CCN."""
+    """Phase 2 for one object: trains the mask, spatial transformer and identity networks with the loss L2.
+
+    `ccn` holds the tensors of the object's finished CCN.
+    """
 
     def __init__(self, config: TrainingConfig, views: list[ObjectViews], part: str, device: torch.device,
                  ccn: dict[str, Tensor]):
@@ -80,7 +88,10 @@ class PaperExtractionTask:
 
     @torch.no_grad()
     def _expected(self, first: Tensor, second: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """p(p' | p, a) of the views `second` [B], where p is drawn from what the clean views `first` [B] show."""
+        """Mean and standard deviation of p(p' | p, a) for the views `second` [B].
+
+        p is drawn from the latent pose of the clean views `first` [B], a is the displacement from first to second.
+        """
         mean, std = self.ccn.encoder(self.clean.clean(first))
         azimuth = wrapped(self.clean.azimuth[second] - self.clean.azimuth[first])
         displacement = torch.stack([azimuth, self.clean.elevation[second] - self.clean.elevation[first]], dim=1)
@@ -88,7 +99,7 @@ class PaperExtractionTask:
         return self.ccn.transition(mean + std * noise, displacement)
 
     def after(self, step: int, smoothed: dict[str, float]) -> None:
-        """Nothing adapts."""
+        """Does nothing, because this task has no weights that adapt."""
 
     @torch.inference_mode()
     def evaluate(self) -> dict[str, float]:
@@ -105,12 +116,13 @@ class PaperExtractionTask:
 
 def loss_l2(network: PaperExtraction, ccn: CCN, batch: FrameBatch, clean: Tensor,
             expected: tuple[Tensor, Tensor] | None, *, kl: float, guide: float) -> tuple[Tensor, dict[str, float]]:
-    """The masking, cropping and identification errors, and the KL terms of the latent that the crop gives: against the
-    one `expected` after a displacement, and against a standard normal. What is not seen has neither crop nor latent.
+    """The loss L2 (paper, equation 5) and its parts: errors of masking, cropping and identification, and two KL terms.
 
-    Squared errors are summed over pixels: with means the KL terms outweigh them, and the mask network learns to cut
-    nothing out. `expected` is None where the KL terms do not count. `guide` is the weight of the error of centre (in
-    half images) and log scale, which is not in the paper.
+    The KL terms compare the latent pose of the crop with the one `expected` after a displacement, and with a standard
+    normal distribution; `kl` is their weight. If `expected` is None they do not count. An object that is not seen
+    counts only in the errors of masking and identification. `guide` is the weight of the error of centre (in half
+    images) and log scale, which is not in the paper. Squared errors are summed over pixels: with means the KL terms
+    outweigh them, and the mask network learns to cut nothing out.
     """
     mask, center, scale, crop, logit = network(batch.image.contiguous(memory_format=torch.channels_last))
     visible = batch.visible[:, 0]

@@ -1,4 +1,4 @@
-"""What the paper's networks are trained on: an object's views from 0.40 m, and images composed of them (appendix B)."""
+"""The data for training the paper's networks: views from 0.40 m, and images composed of them (paper, appendix B)."""
 
 from __future__ import annotations
 
@@ -16,17 +16,18 @@ from saccade.shared.world.windows import CROP_PX
 from saccade.training.crops import REFERENCE_SHELL, warp
 from saccade.training.frames import FrameBatch
 
-SCALES = (0.283, 4.0)  # 0.40 m / range, of every object in an image; the ranges are even, which the paper leaves open
+# Limits of 0.40 m / range for every object in an image. Ranges are drawn uniformly; the paper does not say how.
+SCALES = (0.283, 4.0)
 EMPTY = 0.3  # share of the images without the object
-LEVELS = 4  # of the tile pyramid: 128, 64, 32, 16 pixels
-SAMPLES = 4  # per pixel of a clean view and direction, so that a tile made smaller does not flicker
+LEVELS = 4  # levels of the tile pyramid: 128, 64, 32 and 16 pixels
+SAMPLES = 4  # samples per pixel of a clean view along each axis, so that a tile that is made smaller does not flicker
 
 Uniform = Callable[..., Tensor]
 
 
 @dataclass(frozen=True)
 class CleanCrops:
-    """B views of one object on black [B, 3, 64, 64], as `training.crops.CropBatch` but with nothing done to them."""
+    """B clean views of one object on black [B, 3, 64, 64], with the same properties as `training.crops.CropBatch`."""
 
     target: Tensor
 
@@ -37,17 +38,17 @@ class CleanCrops:
 
     @property
     def masked(self) -> Tensor:
-        """What the CCN sees: the view."""
+        """The input of the CCN: the view."""
         return self.target
 
     @property
     def visible(self) -> Tensor:
-        """All of the object [B]."""
+        """The share of the object that is visible [B], always 1."""
         return torch.ones(len(self.target), device=self.target.device)
 
 
 class CleanViews:
-    """The dataset of phase 1: an object's views from 0.40 m, as large in the crop as in the camera's image."""
+    """The dataset of phase 1: views of one object from 0.40 m. Each crop covers the whole camera image."""
 
     def __init__(self, views: ObjectViews, device: torch.device):
         self.device = device
@@ -61,21 +62,25 @@ class CleanViews:
         return self.crops[index].float() / 255.0
 
     def compose(self, index: Tensor, generator: torch.Generator, *, jitter: float = 0.0) -> CleanCrops:
-        """The same, under the name that the augmented views have: here nothing is drawn and nothing jitters."""
+        """The clean views as a batch. The name is that of `CropComposer`, but nothing is random here."""
         return CleanCrops(self.clean(index))
 
 
 class PaperFrames:
-    """Images of phase 2: the object and one of another kind, each anywhere and at any scale, before two rectangles."""
+    """The images of phase 2: the object and one other object in front of two rectangles.
+
+    Both objects are anywhere in the image and at any scale.
+    """
 
     def __init__(self, views: ObjectViews, others: list[ObjectViews], device: torch.device):
         self.device = device
         self.pyramids = [_pyramid(v, device) for v in (views, *others)]
-        self.ratios = [v.crop_side_m / CROP_SIDE_M for v in (views, *others)]  # a tile's side in the image at scale 1
-        self.coverage = self.pyramids[0][0][:, 3].float().mean((1, 2)) / 255.0  # of the object's tiles [N]
+        # The side of each object's tiles at scale 1, in image widths.
+        self.ratios = [v.crop_side_m / CROP_SIDE_M for v in (views, *others)]
+        self.coverage = self.pyramids[0][0][:, 3].float().mean((1, 2)) / 255.0  # mean coverage of each tile [N]
 
     def compose(self, index: Tensor, generator: torch.Generator) -> FrameBatch:
-        """Images of the object's directions `index` [B]; where it is absent it is `visible` 0. K is 1."""
+        """Composes images of the object in the directions `index` [B] (K = 1). Where it is absent, `visible` is 0."""
         def uniform(*shape: int) -> Tensor:
             return torch.rand(*shape, generator=generator, device=self.device)
 
@@ -94,6 +99,7 @@ class PaperFrames:
         return FrameBatch(image, mask, (center[:, None] + 1) / 2, scale.log()[:, None], visible[:, None])
 
     def _distractor(self, count: int, uniform: Uniform) -> tuple[Tensor, Tensor]:
+        """Layers [B, 4, 120, 120] with a random other object, and its scales [B]."""
         center, scale = _place(count, uniform)
         which = (uniform(count) * (len(self.pyramids) - 1)).long() + 1
         draw = uniform(count)
@@ -106,7 +112,7 @@ class PaperFrames:
         return layer, scale
 
     def _layer(self, which: int, index: Tensor, center: Tensor, scale: Tensor) -> Tensor:
-        """Tiles drawn where they belong [B, 4, 120, 120], each from the pyramid's level that has about its size."""
+        """Layers [B, 4, 120, 120] of tiles at these centres and scales, from the pyramid level of about this size."""
         scale = scale * self.ratios[which]
         levels = torch.log2(TILE_PX / (scale * CANVAS_PX)).round().clamp(0, LEVELS - 1).long()
         layer = torch.empty(len(index), 4, CANVAS_PX, CANVAS_PX, device=self.device)
@@ -124,6 +130,7 @@ def _reference(views: ObjectViews) -> Tensor:
 
 
 def _pyramid(views: ObjectViews, device: torch.device) -> list[Tensor]:
+    """The tiles from 0.40 m [N, 4, T, T] uint8 with T = 128, 64, 32 and 16 pixels."""
     levels = [_reference(views)]
     for _ in range(LEVELS - 1):
         levels.append(F.avg_pool2d(levels[-1].float(), 2).round().to(torch.uint8))
@@ -131,20 +138,20 @@ def _pyramid(views: ObjectViews, device: torch.device) -> list[Tensor]:
 
 
 def _in_image(tiles: Tensor, side_m: float) -> Tensor:
-    """Tiles [N, 4, 128, 128] as the 480 image shows them from 0.40 m, reduced to [N, 3, 64, 64] uint8."""
+    """Tiles [N, 4, 128, 128] as the camera's image shows them from 0.40 m, reduced to [N, 3, 64, 64] uint8."""
     scale, nought = torch.full((len(tiles),), side_m / CROP_SIDE_M), torch.zeros(len(tiles))
     large = warp(tiles[:, :3].float(), torch.zeros(len(tiles), 2), scale, nought, SAMPLES * CROP_PX)
     return F.avg_pool2d(large, SAMPLES).round().to(torch.uint8)
 
 
 def _place(count: int, uniform: Uniform) -> tuple[Tensor, Tensor]:
-    """Centres [B, 2] anywhere in the image ([-1, 1]) and scales [B] of ranges that are even between their limits."""
+    """Draws centres [B, 2] uniformly in the image ([-1, 1]), and scales [B] whose ranges are uniform."""
     far, near = (1 / scale for scale in SCALES)
     return uniform(count, 2) * 2 - 1, 1 / (near + (far - near) * uniform(count))
 
 
 def _backgrounds(count: int, uniform: Uniform) -> Tensor:
-    """Two rectangles of any colour, place, size and direction on black [B, 3, 120, 120]."""
+    """Draws backgrounds [B, 3, 120, 120]: two rectangles of random colour, place, size and direction on black."""
     axis = (torch.arange(CANVAS_PX, device=uniform(1).device) + 0.5) / CANVAS_PX * 2 - 1
     image = torch.zeros(count, 3, CANVAS_PX, CANVAS_PX, device=axis.device)
     for _ in range(2):

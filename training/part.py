@@ -1,8 +1,9 @@
-"""Trains one part (the CCN and identity network of an object, or the extraction network) in one process.
+"""Trains one part of a run in one process: the CCN and identity network of an object, or the extraction network.
 
     python -m saccade.training.part RUN_DIR PART
 
-Every step draws its randomness from (seed, part, step), so that a run that was interrupted goes on exactly.
+The randomness of every step depends on (seed, part, step) only. So a run that was interrupted continues exactly as it
+would have without the interruption.
 """
 
 from __future__ import annotations
@@ -27,28 +28,34 @@ from saccade.training.paper import PaperCcnTask, PaperExtractionTask
 from saccade.training.settings import TrainingConfig, load_settings
 from saccade.training.tasks import CcnTask, ExtractionTask
 
-SMOOTHING = 0.99
+SMOOTHING = 0.99  # of the running mean of the losses
 
 
 def pick_device(name: str) -> torch.device:
-    """The device named, or the GPU where there is one. Raises SaccadeError where the GPU asked for is absent."""
+    """The device that is named (`cpu`, `cuda`). `auto` means the GPU if there is one, otherwise the CPU.
+
+    Raises SaccadeError if `cuda` is named and there is no GPU.
+    """
     if name == "cuda" and not torch.cuda.is_available():
         raise SaccadeError("device cuda is not there: use --device cpu, or install a driver and a CUDA build of torch")
     return torch.device("cuda" if name == "cuda" or (name == "auto" and torch.cuda.is_available()) else "cpu")
 
 
 def rate_at(step: int, steps: int, peak: float) -> float:
-    """Warm-up over 100 steps, then a cosine to 2 % of the peak."""
+    """The learning rate at a step: it rises over 100 steps, and falls with a cosine to 2 % of the peak."""
     return peak * min(1.0, (step + 1) / 100) * (0.02 + 0.98 * 0.5 * (1 + np.cos(np.pi * step / steps)))
 
 
 def constant_rate(step: int, steps: int, peak: float) -> float:
-    """As in the paper."""
+    """The constant learning rate of the paper."""
     return peak
 
 
 def task_of(run_dir: Path, config: TrainingConfig, views: list[ObjectViews], part: str, device: torch.device):
-    """What a part of this architecture trains."""
+    """Creates the training task of a part, for the architecture of the run.
+
+    Raises SaccadeError if the part needs a CCN that is not finished.
+    """
     extraction = config.is_extraction(part)
     if config.architecture == "default":
         return (ExtractionTask if extraction else CcnTask)(config, views, part, device)
@@ -59,7 +66,11 @@ def task_of(run_dir: Path, config: TrainingConfig, views: list[ObjectViews], par
 
 
 class Trainer:
-    """The loop: steps, checkpoints, losses, pictures. Its folder is `RUN_DIR/PART`."""
+    """The training loop of a part. It writes checkpoints, losses and pictures into the folder `RUN_DIR/PART`.
+
+    If the folder has a checkpoint, training continues from it. Raises SaccadeError if the settings, the views or the
+    checkpoint are missing or damaged, or if the device is not available.
+    """
 
     def __init__(self, run_dir: Path, part: str):
         self.config, self.folder, self.part = load_settings(run_dir), run_dir / part, part
@@ -78,6 +89,7 @@ class Trainer:
         self.resume()
 
     def train(self) -> None:
+        """Trains until the last step. Raises SaccadeError if the loss is not finite."""
         started, before = time.monotonic(), self.seconds
         while self.step < self.steps:
             for group in self.optimizer.param_groups:
@@ -100,6 +112,7 @@ class Trainer:
                 self.checkpoint()
 
     def report(self, measured: dict[str, float]) -> None:
+        """Writes the progress and, if there are `measured` values, one line of losses.jsonl."""
         state = {"step": self.step, "steps": self.steps, "seconds": round(self.seconds, 1),
                  **{k: round(v, 4) for k, v in self.smoothed.items()}, **{k: round(v, 4) for k, v in measured.items()}}
         (self.folder / "progress.json").write_text(json.dumps(state))
@@ -108,7 +121,10 @@ class Trainer:
                 file.write(json.dumps(state) + "\n")
 
     def checkpoint(self) -> None:
-        """Model, optimiser and counters, replaced in one move, so that an interruption leaves the old or the new."""
+        """Saves networks, optimiser and counters, then evaluates and draws samples.
+
+        The file is replaced in one operation, so that after an interruption either the old or the new one exists.
+        """
         tensors = {f"model.{k}": v.contiguous() for k, v in self.task.module.state_dict().items()}
         for n, state in self.optimizer.state_dict()["state"].items():
             tensors |= {f"optimizer.{n}.{k}": torch.as_tensor(v).contiguous() for k, v in state.items()}
@@ -123,6 +139,7 @@ class Trainer:
         self.task.module.train()
 
     def resume(self) -> None:
+        """Continues from the checkpoint, if there is one. Raises SaccadeError if it is damaged."""
         path = self.folder / CHECKPOINT
         if not path.is_file():
             return
@@ -140,7 +157,7 @@ class Trainer:
 
 
 def main() -> int:
-    """The process. Exit code 2 and one line for what the user can mend."""
+    """Runs the process. For an error that the user can correct it prints one line and returns the exit code 2."""
     torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
     try:
         Trainer(Path(sys.argv[1]), sys.argv[2]).train()

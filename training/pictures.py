@@ -1,4 +1,4 @@
-"""Sample pictures of a training run: what went in, what the networks made of it."""
+"""Sample pictures of a training run: inputs of the networks and their outputs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from saccade.training.frames import FrameBatch
 
 
 def _save(path: Path, rows: list[Tensor]) -> None:
-    """Rows of images [N, 3, H, W] in [0, 1], one below the other."""
+    """Saves rows of images [N, 3, H, W] in [0, 1], one below the other, twice as large."""
     strips = [torch.cat(list(row.float().cpu().clamp(0, 1)), dim=2) for row in rows]
     picture = (torch.cat(strips, dim=1).permute(1, 2, 0).numpy() * 255).astype(np.uint8)
     Image.fromarray(picture).resize((picture.shape[1] * 2, picture.shape[0] * 2), Image.Resampling.NEAREST).save(path)
@@ -26,7 +26,7 @@ def _save(path: Path, rows: list[Tensor]) -> None:
 
 @torch.inference_mode()
 def draw_ccn(path: Path, ccn: CCN, pair: Pair) -> None:
-    """Rows: input | masked crop | reconstruction | prediction after the transition | what should be seen there."""
+    """Draws rows: input | masked crop | reconstruction | prediction after the transition | true view after it."""
     mean, _ = ccn.encoder(pair.first.masked)
     moved, _ = ccn.transition(mean, pair.displacement)
     _save(path, [pair.first.rgb, pair.first.masked[:, :3], ccn.decoder(mean), ccn.decoder(moved), pair.second.target])
@@ -34,7 +34,7 @@ def draw_ccn(path: Path, ccn: CCN, pair: Pair) -> None:
 
 @torch.inference_mode()
 def draw_paper_extraction(path: Path, network: PaperExtraction, batch: FrameBatch, clean: Tensor) -> None:
-    """Rows: input | true mask | predicted mask | masked crop | the crop that it should be [B, 3, 64, 64]."""
+    """Draws rows: input | true mask | predicted mask | masked crop | true crop (`clean` [B, 3, 64, 64])."""
     mask, _, _, crop, _ = network(batch.image)
     rows = (batch.image, batch.mask.expand(-1, 3, -1, -1), mask.expand(-1, 3, -1, -1), crop[:, :3], clean)
     _save(path, [F.interpolate(row, size=batch.image.shape[-2:]) for row in rows])
@@ -42,7 +42,10 @@ def draw_paper_extraction(path: Path, network: PaperExtraction, batch: FrameBatc
 
 @torch.inference_mode()
 def draw_extraction(path: Path, network: Extraction, batch: FrameBatch) -> None:
-    """Rows: input | true masks | predicted masks, with a cross where each present object's centre is believed."""
+    """Draws rows: input | true masks | predicted masks.
+
+    In the input a cross marks the predicted centre of each object that is predicted to be present.
+    """
     masks, vote_logits, votes = network(batch.image)
     presence, center, _ = tally(vote_logits, votes)
     size = batch.image.shape[-2:]

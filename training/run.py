@@ -1,4 +1,4 @@
-"""A training run: renders the views, trains all parts side by side, shows progress, exports the weights."""
+"""A training run: it renders the views, trains all parts in parallel, shows the progress and exports the weights."""
 
 from __future__ import annotations
 
@@ -26,7 +26,10 @@ from saccade.training.settings import EXTRACTION, TrainingConfig, load_settings
 
 
 def start(run_dir: Path, config: TrainingConfig) -> TrainingConfig:
-    """Makes the run's folder, or goes on with the one that is there. Raises SaccadeError where that is another run."""
+    """Creates the folder of a run, or continues the run that is there. Returns its configuration.
+
+    Raises SaccadeError if the folder holds a run with other settings, or if the device is not available.
+    """
     pick_device(config.device)
     run_dir.mkdir(parents=True, exist_ok=True)
     path = run_dir / "training.json"
@@ -37,7 +40,10 @@ def start(run_dir: Path, config: TrainingConfig) -> TrainingConfig:
 
 
 def train(run_dir: Path, config: TrainingConfig, *, jobs: int, console: Console) -> None:
-    """Trains every part that is not finished, `jobs` at a time, each in a process of its own."""
+    """Trains every part that is not finished, each in its own process, at most `jobs` at a time.
+
+    Raises SaccadeError if the run cannot be started, or if a part fails.
+    """
     start(run_dir, config)
     columns = (TextColumn("{task.description:>24}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
                TextColumn("{task.fields[note]}"))
@@ -93,7 +99,7 @@ def _show_part(run_dir: Path, part: str, config: TrainingConfig, show) -> None:
 
 
 def export(run_dir: Path, weights_dir: Path) -> None:
-    """Writes the weights of a finished run and their manifest. Raises SaccadeError where a part is not finished."""
+    """Writes the weights of a finished run and their manifest. Raises SaccadeError if a part is not finished."""
     config = load_settings(run_dir)
     states, losses, commits, seconds = {}, {}, {}, 0.0
     for part in config.parts:
@@ -117,8 +123,10 @@ def export(run_dir: Path, weights_dir: Path) -> None:
 
 
 def _calibration(config: TrainingConfig, losses: dict[str, dict]) -> dict[str, float]:
-    """Standard deviations of the percepts of the paper's networks, which have no say in that themselves: of Gaussians
-    with the median errors that were measured on held-out views."""
+    """Standard deviations of the percepts of the paper's networks, which do not predict them themselves.
+
+    They are those of Gaussians with the median errors that were measured on held-out views.
+    """
     measured = {name: losses[f"{name}.{EXTRACTION}"] for name in config.names}
     pixel = {f"{name}.pixel_std": round(max(m["centre_px"] / 1.1774, 2.0), 2) for name, m in measured.items()}
     return pixel | {f"{name}.log_scale_std": round(max(m["log_scale"] / 0.6745, 0.02), 4)

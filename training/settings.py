@@ -1,4 +1,4 @@
-"""What a training run is: typed, saved with the run, the same for every process that takes part."""
+"""The settings of a training run. They are typed, saved with the run, and the same for every process of the run."""
 
 from __future__ import annotations
 
@@ -12,21 +12,24 @@ from saccade.shared.errors import SaccadeError
 from saccade.shared.model.weights import Architecture
 
 EXTRACTION = "extraction"
-# What holds for the paper's networks unless told otherwise: its batches and rates (appendix C), but fewer steps: its
-# 5,000 epochs of 450 views are 15,000 and 25,000.
+# Default settings for the paper's networks. Batches and rates are the paper's (appendix C), but there are fewer steps:
+# the paper's 5,000 epochs of 450 views are 15,000 and 25,000 steps.
 PAPER = {"steps_ccn": 5_000, "steps_extraction": 6_000, "batch_ccn": 150, "batch_extraction": 100,
          "rate_ccn": 5e-4, "rate_extraction": 1e-4}
 
 
 class TrainingConfig(Section):
-    """`names`: objects that the networks shall know. `steps_*`: optimisation steps of the two phases. `crops`: what the
-    CCNs see, views as wrong as the detector's crops or, for comparison, as they were rendered.
+    """The settings of a training run.
 
-    `architecture` "paper": the paper's own networks, trained as it says; some settings then have other defaults.
-    `kl_extraction`: weight of the two KL terms in its phase 2, once they count; `guide_extraction`: weight at the start
-    of the error of centre and scale themselves, which the paper leaves to the crop's error alone: with it fewer steps
-    find the object. `ccns`: a folder of weights of these objects whose CCNs are taken as they are, so that phase 2
-    alone is trained. None of the four is written where the architecture is "default".
+    `names` are the objects that the networks learn. `steps_*` are the optimisation steps of the two phases. `crops`
+    says what the CCNs are trained on: crops that are as wrong as the detector's, or, for comparison, clean views.
+
+    With `architecture` "paper" the paper's own networks are trained as the paper describes; some settings then have
+    other defaults. Three settings belong to this architecture. `kl_extraction` is the weight of the two KL terms in
+    phase 2, once they count. `guide_extraction` is the weight, at the start, of the errors of centre and scale
+    themselves. The paper uses only the error of the crop; with the guide fewer steps are needed to find the object.
+    `ccns` is a folder of weights whose CCNs of these objects are used unchanged, so that only phase 2 is trained. If
+    the architecture is "default", these three and `architecture` are not saved.
     """
 
     objects: Literal["pantry", "ycb"] = "pantry"
@@ -61,36 +64,39 @@ class TrainingConfig(Section):
 
     @property
     def parts(self) -> tuple[str, ...]:
-        """The networks that are trained: one process each."""
+        """The parts of the run. Each part is trained by one process."""
         if self.architecture == "paper":
             return (*(() if self.ccns else self.names), *(f"{name}.{EXTRACTION}" for name in self.names))
         return (EXTRACTION, *self.names)
 
     def is_extraction(self, part: str) -> bool:
-        """Whether a part is of phase 2."""
+        """Whether a part belongs to phase 2."""
         return part.rpartition(".")[2] == EXTRACTION
 
     def needs(self, part: str) -> str | None:
-        """The part that has to be finished before this one begins: the paper freezes an object's CCN in phase 2."""
+        """The part that must be finished before this one begins, or None.
+
+        The paper's phase 2 needs the finished CCN of its object.
+        """
         name = self.object_of(part)
         return name if name != part and not self.ccns else None
 
     def object_of(self, part: str) -> str:
-        """The object of a part of the paper's: NAME or NAME.extraction."""
+        """The object of a part of the paper's networks, which is called NAME or NAME.extraction."""
         return part.removesuffix(f".{EXTRACTION}")
 
     def steps(self, part: str) -> int:
-        """Steps of one part."""
+        """The number of optimisation steps of a part."""
         return self.steps_extraction if self.is_extraction(part) else self.steps_ccn
 
 
 def settings_from(values: dict[str, Any]) -> TrainingConfig:
-    """The settings with these values. Raises SaccadeError that names the key."""
+    """Creates the settings from values. Raises SaccadeError, with the name of the key, if one is not valid."""
     return checked(TrainingConfig, values, "training setting {} (see training/settings.py)")
 
 
 def load_settings(run_dir: Path) -> TrainingConfig:
-    """The configuration saved in a run's folder."""
+    """Reads the settings of a run from its folder. Raises SaccadeError if there are none."""
     path = run_dir / "training.json"
     if not path.is_file():
         raise SaccadeError(f"{path} is missing: not the folder of a training run")

@@ -1,7 +1,7 @@
-"""Objects that no network knows: shapes and textures made by code, and known objects in colours that are not theirs.
+"""Strangers: objects that no network knows. They are shapes and textures made by code, or recoloured known objects.
 
-Trained on known objects alone, a network takes whatever is no background for the most similar one. These teach it to
-say no, in a scene and where a goal image shows something else.
+A network that is trained on known objects only takes everything in front of the background for the most similar known
+object. Strangers teach it that an object may be unknown, in a scene and in a goal image.
 """
 
 from __future__ import annotations
@@ -14,15 +14,17 @@ from saccade.shared.world.geometry import REFERENCE_RANGE_M, fibonacci_hemispher
 
 Array = NDArray[np.float64]
 
-KEY = 1  # of their randomness
+KEY = 1  # key of their random numbers
 CROP_SIDE_M = 0.25
 SIZE_M = np.array([0.12, 0.12, 0.14])
-OTHER_COLOUR = 0.12  # a known object whose colours differ less from its own, on average, is still itself
+OTHER_COLOUR = 0.12  # a known object in other colours is a stranger if they differ by more than this on average
 
 
 def strangers(known: list[ObjectViews], seed: int, count: int = 600) -> ObjectViews:
-    """Tiles of `count` unknown things as one object's views from 0.40 m. A third wear a known object's shape, a third
-    of these its texture in other colours."""
+    """Tiles of `count` strangers, in the form of views of one object from 0.40 m.
+
+    A third of them have the shape of a known object. A third of these have its texture in other colours.
+    """
     rng = np.random.default_rng([seed, KEY])
     azimuth, elevation = fibonacci_hemisphere(count)
     tiles = np.stack([_tile(known, rng) for _ in range(count)])[None]
@@ -30,8 +32,10 @@ def strangers(known: list[ObjectViews], seed: int, count: int = 600) -> ObjectVi
 
 
 def texture(rng: np.random.Generator, side_px: int) -> Array:
-    """A random texture [side_px, side_px, 3] in [0, 1]: packaging, or bands of colours, a mosaic, clouds, noise, some
-    of them faint."""
+    """A random texture [side_px, side_px, 3] in [0, 1]: packaging, bands of colours, a mosaic, clouds or noise.
+
+    Some of them have little contrast.
+    """
     kind = rng.choice(5, p=(0.2, 0.1, 0.1, 0.1, 0.5))
     if kind == 4:
         return _packaging(rng, side_px)
@@ -52,7 +56,7 @@ def _pattern(rng: np.random.Generator, side_px: int, kind: int) -> Array:
 
 
 def _packaging(rng: np.random.Generator, side_px: int) -> Array:
-    """A ground with bands, a label and rows of print, in few colours, one side darker [side_px, side_px, 3]."""
+    """A texture [side_px, side_px, 3] like a package: shapes, bands and rows of print in few colours, shaded."""
     axis = (np.arange(side_px) + 0.5) / side_px * 2 - 1
     x, y = np.meshgrid(axis, axis)
     palette = rng.random((4, 3)) ** rng.uniform(0.5, 2.0)
@@ -60,7 +64,7 @@ def _packaging(rng: np.random.Generator, side_px: int) -> Array:
     for colour in palette[1:1 + rng.integers(4)]:
         center, half = rng.uniform(-0.8, 0.8, 2), rng.uniform(0.08, 0.6, 2)
         if rng.random() < 0.4:
-            half[0] = 2.0  # a band around it
+            half[0] = 2.0  # a band over the whole width
         u, v = (x - center[0]) / half[0], (y - center[1]) / half[1]
         image[np.hypot(u, v) < 1 if rng.random() < 0.3 else np.maximum(np.abs(u), np.abs(v)) < 1] = colour
     for _ in range(rng.integers(5)):
@@ -73,7 +77,7 @@ def _packaging(rng: np.random.Generator, side_px: int) -> Array:
 
 
 def _tile(known: list[ObjectViews], rng: np.random.Generator) -> NDArray[np.uint8]:
-    """[T, T, 4] uint8, rgb premultiplied by coverage."""
+    """A tile [T, T, 4] uint8 of a random stranger: RGB, premultiplied by the coverage, and the coverage."""
     pick = rng.random()
     if pick < 1 / 3:
         views = known[rng.integers(len(known))]
@@ -82,7 +86,7 @@ def _tile(known: list[ObjectViews], rng: np.random.Generator) -> NDArray[np.uint
         rgb = recoloured(tile[..., :3], alpha, rng) if pick < 1 / 9 else texture(rng, TILE_PX)
     else:
         alpha, rgb = _shape(rng)[..., None], texture(rng, TILE_PX)
-        if rng.random() < 0.5:  # two surfaces, such as a lid or a side
+        if rng.random() < 0.5:  # two surfaces, for example a side and a lid
             second = _shape(rng)[..., None]
             rgb = np.where(second > 0.5, texture(rng, TILE_PX), rgb)
     image = np.concatenate([rgb * alpha, alpha], axis=-1)
@@ -90,8 +94,10 @@ def _tile(known: list[ObjectViews], rng: np.random.Generator) -> NDArray[np.uint
 
 
 def recoloured(premultiplied: Array, alpha: Array, rng: np.random.Generator) -> Array:
-    """A known object's texture with its channels exchanged, turned over or both; or another texture, should the
-    object still look like itself."""
+    """The texture of a known object with its colour channels exchanged, inverted or both.
+
+    If the object would still look like itself, it gets a random texture.
+    """
     rgb = premultiplied / np.maximum(alpha, 1e-3)
     for _ in range(4):
         other = rgb[..., rng.permutation(3)]
@@ -103,7 +109,7 @@ def recoloured(premultiplied: Array, alpha: Array, rng: np.random.Generator) -> 
 
 
 def _shape(rng: np.random.Generator) -> Array:
-    """A silhouette [T, T] in [0, 1]: a superellipse, or a polygon of a few straight sides; half of them upright."""
+    """A silhouette [T, T] in [0, 1]: a superellipse or a polygon with a few straight sides, half of them upright."""
     x, y = _plane(rng, TILE_PX, turned=rng.random() < 0.5)
     a, b = rng.uniform(0.25, 0.95, 2)
     if rng.random() < 0.5:
@@ -116,7 +122,7 @@ def _shape(rng: np.random.Generator) -> Array:
 
 
 def _plane(rng: np.random.Generator, side_px: int, *, turned: bool = True) -> tuple[Array, Array]:
-    """Coordinates [side_px, side_px] in [-1, 1], turned at random."""
+    """Coordinates x and y [side_px, side_px] in [-1, 1], rotated by a random angle if `turned`."""
     axis = (np.arange(side_px) + 0.5) / side_px * 2 - 1
     x, y = np.meshgrid(axis, axis)
     angle = rng.uniform(0, 2 * np.pi) if turned else 0.0
@@ -124,7 +130,7 @@ def _plane(rng: np.random.Generator, side_px: int, *, turned: bool = True) -> tu
 
 
 def _enlarged(grid: Array, side_px: int, *, smooth: bool) -> Array:
-    """A grid [n + 1, n + 1, 3] over the square: cells, or blended between its corners."""
+    """Enlarges a grid of colours [n + 1, n + 1, 3] to [side_px, side_px, 3]: flat, or interpolated if `smooth`."""
     place = (np.arange(side_px) + 0.5) / side_px * (len(grid) - 1)
     low = place.astype(int)
     part = place - low if smooth else np.zeros(side_px)

@@ -1,4 +1,4 @@
-"""What there is to train: each task has a module, its loss at a step, its measures and its picture."""
+"""The training tasks of the default networks. A task has a module, a loss at each step, an evaluation and a picture."""
 
 from __future__ import annotations
 
@@ -20,31 +20,31 @@ from saccade.training.frames import FrameComposer
 from saccade.training.pictures import draw_ccn, draw_extraction
 from saccade.training.settings import TrainingConfig
 
-IDENTITY_WEIGHT = 50.0
+IDENTITY_WEIGHT = 50.0  # of the identity network's loss
 
 Network = TypeVar("Network", bound=nn.Module)
 
 
 def generator_of(config: TrainingConfig, part: str, device: torch.device, *key: int) -> torch.Generator:
-    """Randomness that depends on the seed, the part and the key (such as the step) alone."""
+    """A random generator that depends only on the seed, the part and the key (for example the step)."""
     entropy = [config.seed, zlib.crc32(part.encode()), *key]
     return torch.Generator(device).manual_seed(int(np.random.SeedSequence(entropy).generate_state(1)[0]))
 
 
 def on_device(module: Network, device: torch.device) -> Network:
-    """The module there, its channels last."""
+    """Moves a module to the device, in the memory format channels-last."""
     return module.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]  # not in torch's stubs
 
 
 def split(views: ObjectViews, seed: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Directions to train on and to hold out: the paper's 90/10 split."""
+    """The indices of the directions to train on and of those to hold out: 90 % and 10 %, as in the paper."""
     order = torch.randperm(len(views.azimuth_rad), generator=torch.Generator().manual_seed(seed))
     cut = int(0.9 * len(order))
     return order[:cut].to(device), order[cut:].to(device)
 
 
 class CcnTask:
-    """Phase 1 of one object: loss L1 and the identity network's loss on the same crops."""
+    """Phase 1 for one object: the loss L1 of the CCN and the loss of the identity network, on the same crops."""
 
     def __init__(self, config: TrainingConfig, views: list[ObjectViews], part: str, device: torch.device):
         torch.manual_seed(config.seed)
@@ -65,9 +65,11 @@ class CcnTask:
         return {"ccn": CCN(), "identity": Identity()}
 
     def generator(self, *key: int) -> torch.Generator:
+        """The random generator of this part for a key, see `generator_of`."""
         return generator_of(self.config, self.part, self.device, *key)
 
     def loss(self, step: int) -> tuple[Tensor, dict[str, float]]:
+        """The loss at a step, and its parts."""
         generator, batch = self.generator(step), self.config.batch_ccn
 
         def pick(count: int) -> Tensor:
@@ -87,20 +89,23 @@ class CcnTask:
         return loss + IDENTITY_WEIGHT * identity, {**parts, "identity": float(identity.detach())}
 
     def after(self, step: int, smoothed: dict[str, float]) -> None:
+        """Adapts the weights of the GECO constraints from time to time. `smoothed` are running means of the parts."""
         if step % LAMBDA_EVERY == 0:
             self.lambdas = adapt(self.lambdas, [smoothed["first"], smoothed["second"], smoothed["moved"]])
 
     def evaluate(self) -> dict[str, float]:
+        """Errors of the goal direction on held-out directions: the median (radians), and shares below two limits."""
         errors = goal_search_errors(self.ccn, self.composer, self.held_out, self.generator(2 ** 31), jitter=0.4)
         return {"goal_median_rad": float(np.median(errors)), "goal_within_0.19": float((errors < 0.19).mean()),
                 "goal_within_0.5": float((errors < 0.5).mean())}
 
     def draw(self, path: Path) -> None:
+        """Saves sample pictures of held-out directions."""
         draw_ccn(path, self.ccn, sample_pair(self.composer, self.held_out, 8, self.generator(2 ** 31)))
 
 
 class ExtractionTask:
-    """Phase 2: loss L2 on composed camera images of all objects."""
+    """Phase 2: the loss L2 of the extraction network, on composed camera images of all objects."""
 
     def __init__(self, config: TrainingConfig, views: list[ObjectViews], part: str, device: torch.device):
         torch.manual_seed(config.seed)
@@ -110,17 +115,20 @@ class ExtractionTask:
         self.lambdas: list[float] = []
 
     def loss(self, step: int) -> tuple[Tensor, dict[str, float]]:
+        """The loss at a step, and its parts."""
         batch = self.composer.compose(self.config.batch_extraction, np.random.default_rng([self.config.seed, step]))
         with torch.autocast(self.device.type, dtype=torch.bfloat16):
             return loss_l2(self.module, batch)
 
     def after(self, step: int, smoothed: dict[str, float]) -> None:
-        """Nothing adapts."""
+        """Does nothing, because this task has no weights that adapt."""
 
     def evaluate(self) -> dict[str, float]:
+        """Errors of the network on 200 images that are always the same, see `errors`."""
         rng = np.random.default_rng([self.config.seed, 2 ** 31])
         return extraction_errors(self.module, self.composer.compose(200, rng))
 
     def draw(self, path: Path) -> None:
+        """Saves sample pictures."""
         rng = np.random.default_rng([self.config.seed, 2 ** 31])
         draw_extraction(path, self.module, self.composer.compose(6, rng))
