@@ -74,7 +74,7 @@ def test_a_killed_recorder_loses_at_most_a_second(tmp_path):
         while (now := time.monotonic()) - start < 3.5:
             step = len(sent_s)
             sent_s[step] = now
-            message = sample(PERCEPT.type, object="mug", step=step, scale=now, seq=step)
+            message = sample(PERCEPT.type, run="run", object="mug", step=step, scale=now, seq=step)
             recorder.bus.publish(PERCEPT, "mug", encode(message))
             time.sleep(0.005)
         killed_s = time.monotonic()
@@ -92,7 +92,7 @@ def test_a_killed_recorder_loses_at_most_a_second(tmp_path):
 def test_the_recorder_finishes_its_file_and_tells_gaps(tmp_path):
     with closing(RecorderProcess(tmp_path / "run")) as recorder:
         for seq in (0, 1, 2, 5, 6):
-            recorder.bus.publish(ACTION, None, encode(sample(ACTION.type, step=seq, seq=seq)))
+            recorder.bus.publish(ACTION, None, encode(sample(ACTION.type, run="run", step=seq, seq=seq)))
         recorder.until(lambda: b"2 lost: action" in b"".join(recorder.said))
         recorder.process.terminate()
         _, error = recorder.process.communicate(timeout=WAIT_S)
@@ -176,7 +176,7 @@ def test_a_recorder_without_room_says_so_and_the_bus_goes_on(tmp_path):
     with closing(RecorderProcess(tmp_path / "run", limit_bytes=600_000)) as recorder:
         step = 0
         while b"not recording" not in b"".join(recorder.said):
-            payload = encode(sample(ACTION.type, step=step, seq=step)) + os.urandom(3000)
+            payload = encode(sample(ACTION.type, run="run", step=step, seq=step)) + os.urandom(3000)
             recorder.bus.publish(ACTION, None, payload)
             step += 1
             time.sleep(0.01)

@@ -211,12 +211,12 @@ def test_missing_steps_and_topics_are_reported(tmp_path):
     messages.append((TRUTH, None, sample(TRUTH.type, run="r", episode=0, step=4, seq=4, done=True)))
     write(tmp_path / "run.mcap", messages).close()
     report = missing(tmp_path / "run.mcap")
-    assert report.absent == [("r", 0, 1, "saccade/test/action"), ("r", 0, 2, "saccade/test/percept/mug")]
+    assert report.absent == [("r", 0, "saccade/test/action", 1, 1), ("r", 0, "saccade/test/percept/mug", 2, 2)]
     assert report.lost == {"saccade/test/action": 1, "saccade/test/percept/mug": 1}
     assert not report.complete
     write(tmp_path / "late.mcap", steps(3, FRAME, first=2)).close()
     assert missing(tmp_path / "late.mcap").lost == {"saccade/test/frame": 2}
-    assert [at[2] for at in missing(tmp_path / "late.mcap").absent] == [0, 1]
+    assert [at[3:] for at in missing(tmp_path / "late.mcap").absent] == [(0, 1)]
     write(tmp_path / "good.mcap", steps(4, FRAME, PERCEPT, ACTION, TRUTH)).close()
     assert missing(tmp_path / "good.mcap").complete
 
@@ -231,4 +231,4 @@ def test_what_holds_for_an_episode_is_missed_where_another_has_it(tmp_path):
     messages = episode(0, GOAL, RESULT) + episode(1, RESULT) + episode(2, GOAL) + episode(3, GOAL, done=False)
     write(tmp_path / "run.mcap", messages).close()
     absent = missing(tmp_path / "run.mcap").absent
-    assert absent == [("r", 1, 0, "saccade/test/goal"), ("r", 2, 0, "saccade/test/result")]
+    assert absent == [("r", 1, "saccade/test/goal", 0, 0), ("r", 2, "saccade/test/result", 0, 0)]

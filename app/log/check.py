@@ -3,50 +3,85 @@
 from __future__ import annotations
 
 import itertools
-import json
+from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 from saccade.app.log.cut import Range, range_of
+from saccade.app.log.source import setting_of
 from saccade.shared.bus.messages import Truth
 from saccade.shared.bus.sequences import Sequences
 from saccade.shared.bus.topics import RESULT, TOPICS
+from saccade.shared.errors import printable
 from saccade.shared.log.reading import RunReader
+from saccade.shared.log.recording import AWAITED, FINISHED
 
 MOST_STRETCHES = 6  # of steps that are named one by one
+MOST_ABSENT = 10_000  # stretches that are looked for: each costs memory, and the steps of a log may be any numbers
+LINE_LIMIT = 400
+
+
+class Absent(NamedTuple):
+    """Steps of an episode without a message of one key, from `first` to `last`."""
+
+    run: str
+    episode: int
+    key: str
+    first: int
+    last: int
 
 
 @dataclass
 class Missing:
     """What a log lacks. `lost`: messages per key, by sequence number; `heartbeats`, of which nobody keeps a copy, apart
-    from them and no reason to call a log incomplete. `absent`: (run, episode, step, key) of topics
-    that every step should have. `repeated`: messages that are there twice. `cut`: why the file is not whole."""
+    from them and no reason to call a log incomplete. `absent`: topics that every step should have, by stretches of
+    steps, the first MOST_ABSENT. `repeated`: messages that are there twice. `unfinished`: how far a run came that was
+    not brought to its end. `episodes`: stretches of whole episodes that are not there. `cut`: why the file is not
+    whole."""
 
     messages: int = 0
     repeated: int = 0
     heartbeats: int = 0
     lost: dict[str, int] = field(default_factory=dict)
-    absent: list[tuple[str, int, int, str]] = field(default_factory=list)
+    absent: list[Absent] = field(default_factory=list)
+    episodes: list[tuple[int, int]] = field(default_factory=list)
     refused: int = 0
+    unfinished: str | None = None
     cut: str | None = None
+
+    @property
+    def count(self) -> int:
+        """How many messages are missing."""
+        return sum(self.lost.values()) + sum(stretch.last - stretch.first + 1 for stretch in self.absent)
 
     @property
     def complete(self) -> bool:
         """There is something, and nothing is missing."""
-        return self.messages > 0 and not (self.lost or self.absent or self.repeated or self.refused or self.cut)
+        return self.messages > 0 and not (self.lost or self.absent or self.repeated or self.refused or self.episodes
+                                          or self.unfinished or self.cut)
 
     def lines(self) -> Iterator[str]:
         """What is missing, a line each."""
+        yield from (printable(line, LINE_LIMIT) for line in self._lines())
+
+    def _lines(self) -> Iterator[str]:
         if self.cut:
             yield self.cut
+        if self.unfinished:
+            yield self.unfinished
         if not self.messages:
             yield "holds no message"
+        if self.episodes:
+            yield f"episodes that are not there: {in_stretches(self.episodes)}"
         for key, count in sorted(self.lost.items()):
             yield f"{key}: {count} messages lost, by their sequence numbers"
-        for (run, episode, key), group in itertools.groupby(
-                sorted(self.absent, key=lambda at: (*at[:2], at[3], at[2])), lambda at: (*at[:2], at[3])):
-            yield f"{key}: not there in episode {episode} of {run}, step {abbreviated(at[2] for at in group)}"
+        for (run, episode, key), group in itertools.groupby(sorted(self.absent), lambda at: at[:3]):
+            steps = in_stretches([(at.first, at.last) for at in group])
+            yield f"{key}: not there in episode {episode} of {run}, step {steps}"
+        if len(self.absent) >= MOST_ABSENT:
+            yield "more steps lack something: they are not listed"
         if self.repeated:
             yield f"{self.repeated} messages are there twice"
         if self.refused:
@@ -55,11 +90,9 @@ class Missing:
 
 def missing(path: Path) -> Missing:
     """Reads a log and reports gaps. The last step of an episode that is done needs no answer to its frame; of a log
-    that was cut out of another only its range is expected. Where nobody waited (`bus.live`) no step needs an answer."""
-    report, reader, sequences = Missing(), RunReader(path), None
-    steps: dict[tuple[str, int], dict[int, set[str]]] = {}
-    held: dict[tuple[str, int], set[str]] = {}  # of each episode: keys that hold for all of it
-    done: set[tuple[str, int, int]] = set()
+    that was cut out of another only its range is expected. Where nobody waited (`bus.live`) no step needs an answer.
+    Raises SaccadeError for a file that is no log, or damaged from its start on."""
+    report, reader, sequences, there = Missing(), RunReader(path), None, _There()
     for topic, part, message in reader:
         sequences = sequences or Sequences(from_start=True, cut=range_of(reader) is not None)
         report.messages += 1
@@ -67,51 +100,94 @@ def missing(path: Path) -> Missing:
         lost = sequences.take(topic, part, message)
         report.repeated += lost is None
         report.heartbeats += 0 if topic.in_step else lost or 0
+        at = message.run, message.episode
         if topic.latched:
-            held.setdefault((message.run, message.episode), set()).add(key)
+            there.held[at].add(key)
         elif topic.in_step:
-            steps.setdefault((message.run, message.episode), {}).setdefault(message.step, set()).add(key)
+            there.steps[at][key].add(message.step)
             if isinstance(message, Truth) and message.done:
-                done.add((message.run, message.episode, message.step))
-    live = json.loads(reader.configuration or "{}").get("bus", {}).get("live", False)
-    if not live:
-        over = {(run, episode) for run, episode, _ in done}
-        report.absent = sorted(_absent(steps, done, range_of(reader))
-                               + _not_held(steps, held, over, RESULT.key(reader.world)))
+                there.done[at].add(message.step)
+    if not report.messages:
+        reader.require_something()
+    kept = range_of(reader)
+    if not setting_of(reader, "bus", "live"):
+        absent = itertools.chain(there.absent(kept), there.not_held(RESULT.key(reader.world)))
+        report.absent = sorted(itertools.islice(absent, MOST_ABSENT))
     if sequences is not None:
         report.lost = {TOPICS[name].key(reader.world, part): lost for (name, part), lost in sequences.missing.items()}
+    if kept is None and AWAITED in reader.metadata:
+        report.unfinished, report.episodes = _unfinished(reader, there)
     report.refused, report.cut = reader.refused, reader.cut
     return report
 
 
-def _absent(steps: dict[tuple[str, int], dict[int, set[str]]], done: set[tuple[str, int, int]],
-            kept: Range | None) -> list[tuple[str, int, int, str]]:
-    keys = set().union(*(there for episode in steps.values() for there in episode.values()))
-    absent = []
-    for episode, there in steps.items():
-        last = max(there)
-        expected = range(last + 1) if kept is None else range(kept.start, max(kept.end or 0, last) + 1)
-        absent += [(*episode, step, key) for step in expected if (*episode, step) not in done
-                   for key in keys - there.get(step, set())]
-    return absent
+class _There:
+    """What is there of each episode: of each key the steps, what holds for all of it, and where it was done."""
+
+    def __init__(self) -> None:
+        self.steps: dict[tuple[str, int], dict[str, set[int]]] = defaultdict(lambda: defaultdict(set))
+        self.held: dict[tuple[str, int], set[str]] = defaultdict(set)
+        self.done: dict[tuple[str, int], set[int]] = defaultdict(set)
+
+    def absent(self, kept: Range | None) -> Iterator[Absent]:
+        """Of each episode and key the steps that are not there, as stretches: there may be more than can be counted."""
+        keys = sorted(set().union(*(of_key for of_key in self.steps.values())))
+        for episode, of_key in self.steps.items():
+            first, last = 0, max(max(steps) for steps in of_key.values())
+            if kept is not None:
+                first, last = kept.start, max(kept.end or 0, last)
+            for key in keys:
+                for stretch in between(of_key.get(key, set()) | self.done.get(episode, set()), first, last):
+                    yield Absent(*episode, key, *stretch)
+
+    def not_held(self, result: str) -> Iterator[Absent]:
+        """What one episode has and another lacks; only one that is over has a result."""
+        keys = set().union(*self.held.values())
+        for episode in self.steps:
+            for key in keys - self.held.get(episode, set()):
+                if key != result or self.done.get(episode):
+                    yield Absent(*episode, key, 0, 0)
 
 
-def _not_held(steps: dict[tuple[str, int], dict[int, set[str]]], held: dict[tuple[str, int], set[str]],
-              over: set[tuple[str, int]], result: str) -> list[tuple[str, int, int, str]]:
-    """What one episode has and another lacks; only one that is over has a result."""
-    keys = set().union(*held.values())
-    return [(*episode, 0, key) for episode in steps for key in keys - held.get(episode, set())
-            if key != result or episode in over]
+def _unfinished(reader: RunReader, there: _There) -> tuple[str | None, list[tuple[int, int]]]:
+    """How far a run came that was not brought to its end, and which whole episodes are not there of one that was."""
+    found = {episode for _, episode in there.steps}
+    if FINISHED not in reader.metadata:
+        last = max(found, default=None)
+        how_far = "before its first step" if last is None else f"in episode {last}"
+        return (f"the run was not finished: it was ended {how_far}, and its source did not say that this was the last "
+                "step; start a new run for the rest"), []
+    told = reader.metadata[FINISHED].get("episodes", "")
+    count = int(told) if told.isascii() and told.isdigit() and len(told) < 20 else 0
+    return None, list(itertools.islice(between(found, 0, count - 1), MOST_ABSENT))
+
+
+def between(numbers: set[int], first: int, last: int) -> Iterator[tuple[int, int]]:
+    """The stretches from `first` to `last` that have none of the numbers, each by its own first and last."""
+    due = first
+    for number in sorted(numbers):
+        if number > last:
+            break
+        if number > due:
+            yield due, number - 1
+        due = max(due, number + 1)
+    if due <= last:
+        yield due, last
 
 
 def abbreviated(numbers: Iterable[int]) -> str:
     """Ascending numbers as stretches: 1-3, 7, 9-12."""
-    stretches: list[list[int]] = []
-    for number in numbers:
-        if stretches and number == stretches[-1][-1] + 1:
-            stretches[-1][1:] = [number]
+    return in_stretches([(number, number) for number in numbers])
+
+
+def in_stretches(stretches: Iterable[tuple[int, int]]) -> str:
+    """Ascending stretches in words, those that follow each other as one: 1-3, 7, 9-12."""
+    joined: list[tuple[int, int]] = []
+    for first, last in stretches:
+        if joined and first == joined[-1][1] + 1:
+            joined[-1] = joined[-1][0], last
         else:
-            stretches.append([number])
-    told = ["-".join(map(str, stretch)) for stretch in stretches]
+            joined.append((first, last))
+    told = [f"{first}" if first == last else f"{first}-{last}" for first, last in joined]
     more = len(told) - MOST_STRETCHES
     return ", ".join(told[:MOST_STRETCHES]) + (f" and {more} stretches more" if more > 0 else "")

@@ -9,7 +9,9 @@ from saccade.app.log.source import whole
 from saccade.shared.bus.wire import MessageError, decode
 from saccade.shared.errors import SaccadeError
 from saccade.shared.log.reading import Recorded, RunReader
-from saccade.shared.log.recording import CUT, ENDED_EARLY, LOG, RecordingStopped, RunLog
+from saccade.shared.log.recording import AWAITED, CUT, ENDED_EARLY, FINISHED, LOG, RecordingStopped, RunLog
+
+NOT_OF_A_PART = (LOG, ENDED_EARLY, AWAITED, FINISHED)  # metadata that speaks of the whole log
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,7 @@ def cut(log: Path, out: Path, *, episode: int | None = None, start: int = 0, end
         try:
             for entry in reader.entries():
                 if target is None:
-                    metadata = {name: told for name, told in reader.metadata.items() if name not in (LOG, ENDED_EARLY)}
+                    metadata = {name: told for name, told in reader.metadata.items() if name not in NOT_OF_A_PART}
                     metadata[CUT] = {name: str(number) for name, number in vars(kept).items()}
                     target = RunLog(partial, world=reader.world, configuration=reader.configuration or "{}",
                                     metadata=metadata)

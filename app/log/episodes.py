@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from functools import cached_property
@@ -25,7 +24,7 @@ from saccade.shared.bus.topics import (
     Topic,
 )
 from saccade.shared.bus.wire import MessageError, Stamp, decode, stamp_of
-from saccade.shared.config import Config, validate
+from saccade.shared.config import Config, recorded
 from saccade.shared.errors import SaccadeError
 from saccade.shared.log.reading import RunReader
 
@@ -153,7 +152,7 @@ class Log:
             next(RunReader.entries(self._reader), None)  # it stands before the first message
         if self._reader.configuration is None:
             raise SaccadeError(f"log {self.path} holds no configuration")
-        return validate(json.loads(self._reader.configuration), f"the log {self.path}")
+        return recorded(self._reader.configuration, f"the log {self.path}")
 
     @property
     def objects(self) -> tuple[str, ...]:

@@ -13,8 +13,11 @@ from saccade.app.log.traffic import Keys
 from saccade.shared.bus.messages import Result
 from saccade.shared.bus.sequences import Sequences
 from saccade.shared.bus.wire import MessageError, decode
+from saccade.shared.errors import printable
 from saccade.shared.log.reading import RunReader
+from saccade.shared.log.recording import AWAITED, FINISHED
 
+LINE_LIMIT = 20_000
 SHORT = 12  # digits of a hash
 
 
@@ -43,7 +46,7 @@ class LogInfo:
 
 
 def gather(log: Path) -> LogInfo:
-    """Reads a log whole. Raises SaccadeError if it is none."""
+    """Reads a log whole. Raises SaccadeError if it is none, or damaged from its start on."""
     reader = RunReader(log)
     info = LogInfo(reader, log.stat().st_size)
     for topic, part, payload, time_ns in reader.entries():
@@ -60,12 +63,18 @@ def gather(log: Path) -> LogInfo:
         info.steps[message.episode] = max(info.steps.get(message.episode, 0), message.step)
         if isinstance(message, Result):
             info.results[message.episode] = message
+    if not info.keys.found:
+        reader.require_something()
     info.kept = range_of(reader)
     return info
 
 
 def lines(info: LogInfo) -> Iterator[str]:
     """All but the table, a line each."""
+    yield from (printable(line, LINE_LIMIT) for line in _lines(info))
+
+
+def _lines(info: LogInfo) -> Iterator[str]:
     reader, run = info.reader, info.reader.metadata.get("run", {})
     first_ns = min((key.first_ns for key in info.keys.found.values()), default=0)
     began = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(first_ns / 1e9)) if first_ns else "never"
@@ -86,6 +95,10 @@ def lines(info: LogInfo) -> Iterator[str]:
         yield f"recovered from {told.get('log', '')}; lost: {told.get('lost') or 'nothing'}"
     if info.refused:
         yield f"{info.refused} entries are no valid messages"
+    if reader.others:
+        yield f"{reader.others} entries are under keys that are none of Saccade's"
+    if AWAITED in reader.metadata and FINISHED not in reader.metadata:
+        yield "the run was not finished: its source did not say that it was over"
     if reader.cut:
         yield reader.cut
 

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
 
-from mcap.records import Attachment, Channel, McapRecord, Message, Metadata, Schema
-from mcap.writer import Writer
+from mcap.records import Attachment, Channel, Header, McapRecord, Message, Metadata, Schema
+from mcap.writer import MCAP0_MAGIC, Writer
 
 from saccade.app.log.salvage import Salvage, Skipped
 from saccade.app.log.source import whole
-from saccade.shared.errors import SaccadeError
-from saccade.shared.log.recording import ENDED_EARLY, LOG
+from saccade.shared.bus.topics import parse_key
+from saccade.shared.errors import SaccadeError, printable
+from saccade.shared.files import opened
+from saccade.shared.log.foreign import NAME_LIMIT, describe, foreign, is_key
+from saccade.shared.log.reading import ANY_SIZE, MOST_NOTES, NEED
+from saccade.shared.log.recording import ENDED_EARLY, KEY, LOG, channel_of, json_schema, key_metadata
 
+LOST_LIMIT = 20_000  # characters of what is said about it in the new file
 RECOVERED = "recovered"  # metadata of a recovered log: from which, and what was lost
 
 
@@ -30,6 +36,9 @@ class Recovered:
     ended_early: str | None = None
     nameless: int = 0
     told: Counter = field(default_factory=Counter)  # metadata by name
+    left_out: int = 0  # metadata beyond what a log has
+    profile: str = ""
+    ours: bool = False  # whether any message is under a key of Saccade's
 
     def lines(self) -> Iterator[str]:
         """What was lost, a line each; none where nothing was."""
@@ -38,12 +47,14 @@ class Recovered:
             yield f"skipped at byte {stretch.offset}: {stretch.reason}, {stretch.size} bytes{held}"
         if self.nameless:
             yield f"left out: {self.nameless} messages whose key stood in a damaged chunk"
+        if self.left_out:
+            yield f"left out: {self.left_out} records of metadata, more than a log has"
         if self.after_cut:
             yield f"lost behind the cut: {self.after_cut} bytes"
         elif not self.ended:
             yield "the recording was not finished: it lacks what was not yet on the disk"
         if self.ended_early is not None:
-            yield f"the recording had ended early: {self.ended_early}"
+            yield f"the recording had ended early: {printable(self.ended_early)}"
         if self.skipped and not self.told[LOG]:
             yield "the log does not say its format: it is taken for the oldest"
 
@@ -51,31 +62,48 @@ class Recovered:
 def recover(log: Path, out: Path) -> Recovered:
     """Writes every whole record of `log` into the new file `out`, with its times, in its order, and an index.
 
-    `log` is only read. Raises SaccadeError if it cannot be read or holds no whole message, or if `out` is there
-    already or cannot be written.
+    `log` is only read. Raises SaccadeError if it cannot be read, is no log of Saccade or holds no whole message, or if
+    `out` is there already or cannot be written.
     """
+    with opened(log, "log", NEED, ANY_SIZE) as stream:
+        is_mcap = stream.read(len(MCAP0_MAGIC)) == MCAP0_MAGIC
+    if is_mcap and (other := foreign(log)) is not None:
+        raise SaccadeError(other)
+    channels: dict[int, Channel] = {}
+    with whole(out) as partial:
+        report = _copied(log, partial, channels)
+        if report.nameless and channels:  # their channel may have come behind them
+            report = _copied(log, partial, channels)
+        if not report.messages:
+            raise SaccadeError(f"log {log} " + (
+                "is empty: nothing was recorded" if log.stat().st_size == 0 else
+                "holds no whole message: there is nothing to recover" if is_mcap else
+                "is not an MCAP file, and holds no whole message of one: there is nothing to recover"))
+        if not report.ours:
+            raise SaccadeError(describe(log, report.profile, [channel.topic for channel in channels.values()]))
+    return report
+
+
+def _copied(log: Path, out: Path, channels: dict[int, Channel]) -> Recovered:
+    """The new file. `channels`: those that are known beforehand; behind it, those that have been found."""
     source, report = Salvage(log), Recovered()
-    with whole(out) as partial, partial.open("wb") as stream:
-        copy = Copy(stream, report)
+    with out.open("wb") as stream:
+        copy = Copy(stream, report, channels)
         for record in source.records():
             copy.take(record)
-        if not report.messages:
-            empty = log.stat().st_size == 0
-            raise SaccadeError(f"log {log} " + ("is empty: nothing was recorded" if empty else
-                                                "holds no whole message: there is nothing to recover"))
         report.skipped, report.after_cut, report.ended = source.skipped, source.after_cut, source.ended
-        copy.close({"log": log.name, "lost": "; ".join(report.lines())})
+        copy.close({"log": log.name, "lost": printable("; ".join(report.lines()), LOST_LIMIT)})
     return report
 
 
 class Copy:
     """A new MCAP file of the records of another."""
 
-    def __init__(self, stream: BinaryIO, report: Recovered) -> None:
+    def __init__(self, stream: BinaryIO, report: Recovered, channels: dict[int, Channel]) -> None:
         self._writer, self._report = Writer(stream), report
         self._writer.start()
         self._schemas: dict[int, Schema] = {}
-        self._channels: dict[int, Channel] = {}
+        self._found, self._channels = channels, dict(channels)
         self._ids: dict[str, int] = {}  # in the new file, of what a channel or a schema says
 
     def take(self, record: McapRecord) -> None:
@@ -83,7 +111,9 @@ class Copy:
         if isinstance(record, Message):
             self._message(record)
         elif isinstance(record, Channel):
-            self._channels[record.id] = record
+            self._channels[record.id] = self._found[record.id] = record
+        elif isinstance(record, Header):
+            self._report.profile = record.profile[:NAME_LIMIT]
         elif isinstance(record, Schema):
             self._schemas[record.id] = record
         elif isinstance(record, Metadata):
@@ -103,6 +133,7 @@ class Copy:
             self._report.nameless += 1
             return
         self._report.messages += 1
+        self._report.ours |= is_key(channel.topic)
         self._writer.add_message(self._channel(channel), message.log_time, message.data, message.publish_time,
                                  message.sequence)
 
@@ -110,8 +141,12 @@ class Copy:
         schema = self._schemas.get(channel.schema_id)
         about = repr((channel, schema))
         if about not in self._ids:
-            self._ids[about] = self._writer.register_channel(
+            if schema is None and is_key(channel.topic):
+                schema = _schema_of(channel.topic)
+            new = self._ids[about] = self._writer.register_channel(
                 channel.topic, channel.message_encoding, self._schema(schema), channel.metadata)
+            if is_key(channel.topic):
+                self._writer.add_metadata(KEY, key_metadata(new, channel.topic))
         return self._ids[about]
 
     def _schema(self, schema: Schema | None) -> int:
@@ -123,8 +158,23 @@ class Copy:
         return self._ids[about]
 
     def _metadata(self, record: Metadata) -> None:
+        if record.name == KEY:
+            channel = channel_of(record.metadata)
+            if channel is not None:
+                self._channels.setdefault(channel.id, channel)
+            return
+        if self._report.told.total() >= MOST_NOTES:
+            self._report.left_out += 1
+            return
         self._report.told[record.name] += 1
         if record.name == ENDED_EARLY:  # of the recording, not of the recovered log
             self._report.ended_early = record.metadata.get("reason", "")
         elif record.name != RECOVERED:
             self._writer.add_metadata(record.name, record.metadata)
+
+
+def _schema_of(key: str) -> Schema:
+    """The schema of a key's messages, of which the file has lost its own."""
+    message_type = parse_key(key)[1].type
+    text = json.dumps(json_schema(message_type), sort_keys=True).encode()
+    return Schema(id=0, data=text, encoding="jsonschema", name=message_type.__name__)

@@ -4,32 +4,35 @@ from __future__ import annotations
 
 import os
 import re
-import struct
-import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO
 
-import zstandard
 from mcap import records as mcap
-from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.stream_reader import breakup_chunk
 from mcap.writer import MCAP0_MAGIC
 
 from saccade.shared.errors import SaccadeError
-from saccade.shared.log.reading import DAMAGE, MAX_RECORD_BYTES
+from saccade.shared.log.records import (
+    DAMAGE,
+    HEAD,
+    TYPES,
+    Opener,
+    check_attachment,
+    limit_of,
+    parse,
+    summary_of,
+    within,
+)
 
-HEAD = struct.Struct("<BQ")  # of every record: opcode and length
-BROKEN = (*DAMAGE, RuntimeError)  # the last is what lz4 raises
-TYPES: dict[int, Any] = {
-    opcode: getattr(mcap, "".join(word.title() for word in opcode.name.split("_"))) for opcode in Opcode}
 # where reading may start again: a record of one of these kinds, shorter than a terabyte
 ANCHOR = re.compile(rb"(?=[%b](?s:.{5})\x00\x00\x00)" % bytes((
     Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT, Opcode.METADATA, Opcode.DATA_END)))
 WINDOW = 4 * 1024 * 1024  # bytes that are searched at a time
+SEARCH_BYTES = 4 * 1024 ** 3  # that are looked at for where reading may start again, in all
+MOST_SKIPPED = 1000  # stretches that are told one by one
+INDEX_ENTRY_BYTES, INDEX_HEAD_BYTES = 16, 6  # of a chunk's index of messages
 
 
 @dataclass
@@ -52,7 +55,7 @@ class Salvage:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.skipped: list[Skipped] = []
-        self.after_cut, self.ended, self._size = 0, False, 0
+        self.after_cut, self.ended, self._size, self._looked_at = 0, False, 0, 0
         if path.exists() and not path.is_file():
             raise SaccadeError(f"log {path} is not a file")
 
@@ -67,34 +70,46 @@ class Salvage:
             raise SaccadeError(f"log {self.path} cannot be read: {error.strerror or error}") from error
 
     def _data(self, stream: BinaryIO) -> Iterator[mcap.McapRecord]:
-        self.skipped, self.after_cut, self.ended = [], 0, False
-        offset, damaged = len(MCAP0_MAGIC), None
+        self.skipped, self.after_cut, self.ended, self._looked_at = [], 0, False, 0
+        offset, damaged, opener = len(MCAP0_MAGIC), None, Opener(sums=True)
         while offset < self._size and not self.ended:
             opcode, end = self._head(stream, offset)
             try:
                 if end is None:
                     raise ValueError("no record")
-                record = self._parse(stream, offset, opcode, end)
-                if isinstance(record, mcap.Chunk):
-                    damaged = None
-                    yield from _opened(record)
-                elif isinstance(record, mcap.DataEnd | mcap.Footer):
-                    self.ended = True
-                elif isinstance(record, mcap.MessageIndex):  # those of a chunk follow it
+                if opcode == Opcode.MESSAGE_INDEX:  # those of a chunk follow it
+                    held = self._indexed(stream, offset, end)
                     if damaged is not None:
-                        damaged.messages += len(record.records)
+                        damaged.messages += held
+                elif opcode == Opcode.CHUNK:
+                    data = opener.data(self._parse(stream, offset, opcode, end))
+                    for _ in within(data):  # all of it must be whole
+                        pass
+                    damaged = None
+                    yield from within(data)
+                elif opcode in (Opcode.DATA_END, Opcode.FOOTER):
+                    self.ended = True
                 else:
-                    yield record
-            except BROKEN as error:
+                    yield self._parse(stream, offset, opcode, end)
+            except DAMAGE as error:
                 framed = end is not None and (end == self._size or self._head(stream, end)[1] is not None)
                 end = end if framed else self._next_anchor(stream, offset + 1)
                 if end is None:
                     self.after_cut = self._size - offset
                     return
                 what = TYPES[opcode].__name__ if framed else "record"
-                damaged = Skipped(offset, end - offset, f"damaged {what.lower()} ({type(error).__name__})")
-                self.skipped.append(damaged)
+                damaged = self._skip(offset, end, f"damaged {what.lower()} ({type(error).__name__})")
             offset = end
+
+    def _skip(self, offset: int, end: int, reason: str) -> Skipped:
+        """Notes a stretch; what follows the one before it for the same reason, or is too many, belongs to that."""
+        last = self.skipped[-1] if self.skipped else None
+        if last is not None and ((last.reason == reason and last.offset + last.size == offset and not last.messages)
+                                 or len(self.skipped) >= MOST_SKIPPED):
+            last.size = end - last.offset
+            return last
+        self.skipped.append(Skipped(offset, end - offset, reason))
+        return self.skipped[-1]
 
     def _head(self, stream: BinaryIO, offset: int) -> tuple[int, int | None]:
         """The opcode at an offset and where its record ends; None where none can be."""
@@ -104,18 +119,23 @@ class Salvage:
             return 0, None
         opcode, length = HEAD.unpack(head)
         end = offset + HEAD.size + length
-        return opcode, end if opcode in TYPES and length <= MAX_RECORD_BYTES and end <= self._size else None
+        return opcode, end if opcode in TYPES and length <= limit_of(opcode) and end <= self._size else None
 
-    def _parse(self, stream: BinaryIO, offset: int, opcode: int, end: int) -> mcap.McapRecord:
+    def _parse(self, stream: BinaryIO, offset: int, opcode: int, end: int) -> Any:
         stream.seek(offset + HEAD.size)
         body = stream.read(end - offset - HEAD.size)
-        reader = ReadDataStream(BytesIO(body))
-        record = mcap.Message.read(reader, len(body)) if opcode == Opcode.MESSAGE else TYPES[opcode].read(reader)
-        if reader.count != len(body):
-            raise ValueError("its length is not that of its content")
-        if isinstance(record, mcap.Attachment) and zlib.crc32(body[:-4]) != int.from_bytes(body[-4:], "little") != 0:
-            raise ValueError("its checksum is not that of its content")
+        record = parse(opcode, body, exact=True)
+        if opcode == Opcode.ATTACHMENT:
+            check_attachment(body)
         return record
+
+    def _indexed(self, stream: BinaryIO, offset: int, end: int) -> int:
+        """How many messages an index of messages tells of. It may be long, and nothing of it is needed."""
+        stream.seek(offset + HEAD.size + 2)
+        size = int.from_bytes(stream.read(4), "little")
+        if size != end - offset - HEAD.size - INDEX_HEAD_BYTES or size % INDEX_ENTRY_BYTES:
+            raise ValueError("its length is not that of its content")
+        return size // INDEX_ENTRY_BYTES
 
     def _next_anchor(self, stream: BinaryIO, start: int) -> int | None:
         """Where the next record lies that is whole and followed by another or by the end."""
@@ -130,43 +150,19 @@ class Salvage:
         opcode, end = self._head(stream, offset)
         if end is None or (end != self._size and self._head(stream, end)[1] is None):
             return False
+        self._looked_at += end - offset
+        if self._looked_at > SEARCH_BYTES:  # what has so many beginnings was made to have them
+            return False
         try:
+            if opcode == Opcode.MESSAGE_INDEX:
+                return self._indexed(stream, offset, end) > 0
             record = self._parse(stream, offset, opcode, end)
-        except BROKEN:
+        except DAMAGE:
             return False
         return not isinstance(record, mcap.Metadata) or bool(record.name)  # in zeros there are many without a name
 
     def _summary(self, stream: BinaryIO) -> Iterator[mcap.McapRecord]:
         """The schemas and channels that a finished log repeats at its end, in case their chunk is damaged."""
-        end = self._size - len(MCAP0_MAGIC)
-        start = end - HEAD.size - 20
-        opcode, stop = self._head(stream, start) if start > 0 else (0, None)
-        if opcode != Opcode.FOOTER or stop != end:
-            return
-        footer = self._parse(stream, start, opcode, end)
-        if not isinstance(footer, mcap.Footer):
-            return
-        if not 0 < footer.summary_start < start or start - footer.summary_start > MAX_RECORD_BYTES:
-            return
-        stream.seek(footer.summary_start)
-        text = stream.read(end - 4 - footer.summary_start)
-        if zlib.crc32(text) != footer.summary_crc:
-            return
-        offset = footer.summary_start
-        while offset < start:
-            opcode, stop = self._head(stream, offset)
-            if stop is None:
-                return
-            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                yield self._parse(stream, offset, opcode, stop)
-            offset = stop
-
-
-def _opened(chunk: mcap.Chunk) -> list[mcap.McapRecord]:
-    """The records in a chunk. Raises one of BROKEN if it is not whole."""
-    sizes = [chunk.uncompressed_size]
-    if chunk.compression == "zstd":
-        sizes.append(zstandard.frame_content_size(chunk.data))
-    if max(sizes) > MAX_RECORD_BYTES:
-        raise ValueError("its size cannot be")
-    return breakup_chunk(chunk, validate_crc=True)
+        text = summary_of(stream)
+        if text is not None:
+            yield from within(text, (Opcode.SCHEMA, Opcode.CHANNEL))

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
@@ -15,6 +15,7 @@ from saccade.app.run.display import say
 from saccade.shared.bus.messages import Message
 from saccade.shared.bus.wire import MessageError, decode
 from saccade.shared.errors import SaccadeError
+from saccade.shared.files import parse_json
 from saccade.shared.log.folder import LOG_NAME
 from saccade.shared.log.reading import Recorded, RunReader
 
@@ -61,8 +62,19 @@ class Log:
     @property
     def goal_view_is_known(self) -> bool:
         """Whether the truth's goal pose is that of the goal image; known from the first message on."""
-        scene = json.loads(self.reader.configuration or "{}").get("scene", {})
-        return scene.get("goal_image") is None and not scene.get("explore")
+        return setting_of(self.reader, "scene", "goal_image") is None and not setting_of(
+            self.reader, "scene", "explore")
+
+
+def setting_of(reader: RunReader, section: str, key: str) -> Any:
+    """A key of the configuration that a log holds, which may be one that today's Saccade would not take; None where it
+    holds none. Known once its first entry has been read."""
+    try:
+        tree = parse_json(reader.configuration or "{}")
+    except ValueError:  # whoever needs all of it says so
+        return None
+    values = tree.get(section) if isinstance(tree, dict) else None
+    return values.get(key) if isinstance(values, dict) else None
 
 
 @contextmanager

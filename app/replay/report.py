@@ -150,7 +150,7 @@ def _tell_losses(outcome: Outcome, console: Console) -> None:
             table.add_row(name, *(str(n) for n in (status.received, status.published, status.refused, status.skipped,
                                                    status.gaps)))
         console.print(table)
-    lost = sum(report.lost.values()) + len(report.absent)
+    lost = report.count
     say(console, f"loss: {lost} of {report.messages} messages of the replay's log"
         + (f"; {report.cut}" if report.cut else ""))
 

@@ -20,7 +20,7 @@ from saccade.app.run.summary import summary
 from saccade.app.run.supervisor import VIEWER
 from saccade.services.camera.core import build as build_camera
 from saccade.services.camera.sources import absolute, webcam_number
-from saccade.services.recorder.core import describe
+from saccade.services.recorder.core import describe, to_be_finished
 from saccade.services.simulator.objects import names_in_use
 from saccade.services.viewer.server import binary, url_of, with_free_ports
 from saccade.shared.bus.messages import Message, Result
@@ -28,7 +28,7 @@ from saccade.shared.bus.topics import Topic
 from saccade.shared.config import Config
 from saccade.shared.errors import SaccadeError
 from saccade.shared.log.folder import CONFIG_NAME, LOG_NAME
-from saccade.shared.log.recording import RecordingStopped, RunLog
+from saccade.shared.log.recording import FINISHED, RecordingStopped, RunLog
 from saccade.shared.loop.local import run_local
 
 MANIFEST_NAME = "manifest.json"
@@ -141,7 +141,7 @@ def run_here(config: Config, agent: str, folder: Path, display: Display, world: 
     folder.mkdir(parents=True, exist_ok=True)
     config.save(folder / CONFIG_NAME)
     log = RunLog(folder / LOG_NAME, world=config.bus.world, configuration=config.model_dump_json(indent=2),
-                 metadata=describe(config, folder.name))
+                 metadata=describe(config, folder.name) | to_be_finished())
 
     def on_message(topic: Topic, part: str | None, message: Message, payload: bytes | None) -> None:
         end_if_interrupted()
@@ -156,11 +156,24 @@ def run_here(config: Config, agent: str, folder: Path, display: Display, world: 
     with _interrupted_between_messages() as end_if_interrupted:
         try:
             run_local(pairs, config.names, folder.name, on_message=on_message, encoded=True)
+            _finish(log, source)
+        except KeyboardInterrupt:
+            if world_of(world).live:  # one of the ends that the run of a real camera has
+                _finish(log, source)
+            raise
         finally:
             log.close()
             if left_out := getattr(source, "skipped", 0):
                 display.note(f"{left_out} images without a pose were left out")
     return display.progress.results
+
+
+def _finish(log: RunLog, source: object) -> None:
+    """Notes in the log that the run has come to its end."""
+    try:
+        log.note(FINISHED, {"episodes": getattr(source, "episodes", 1)})
+    except RecordingStopped as error:
+        print(f"saccade: {error}", file=sys.stderr)
 
 
 @contextmanager

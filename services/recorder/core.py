@@ -16,18 +16,18 @@ from functools import partial
 from importlib import metadata
 from pathlib import Path
 
-from saccade.shared.bus.messages import Message
+from saccade.shared.bus.messages import Message, Status
 from saccade.shared.bus.outbox import KEPT_BYTES
 from saccade.shared.bus.sequences import Key, Sequences
-from saccade.shared.bus.topics import RESULT, TOPICS, Topic
-from saccade.shared.bus.transport import Bus, ZenohBus
+from saccade.shared.bus.topics import RESULT, STATUS, TOPICS, Topic
+from saccade.shared.bus.transport import Bus, LocalBus, ZenohBus
 from saccade.shared.bus.wire import MessageError, decode
 from saccade.shared.config import Config
-from saccade.shared.errors import SaccadeError
+from saccade.shared.errors import NAME_LIMIT, SaccadeError, printable, told
 from saccade.shared.log.folder import LOG_NAME
 from saccade.shared.log.provenance import commit
 from saccade.shared.log.reading import RunReader
-from saccade.shared.log.recording import CUT, FLUSH_S, RecordingStopped, RunLog
+from saccade.shared.log.recording import AWAITED, CUT, FINISHED, FLUSH_S, RecordingStopped, RunLog
 from saccade.shared.loop.process import Health, Heartbeat, Inbox, Item, run_process
 
 NAME = "recorder"
@@ -73,6 +73,8 @@ class Recorder:
         self._sequences = Sequences(from_start=True, cut=config.bus.first_step > 0)
         self._last: dict[Key, tuple[int, int]] = {}  # newest (episode, step) of each key
         self._names = config.scene.names or ()
+        self._left_out: set[str] = set()  # reasons for which the log did not take messages, each told once
+        self._finished = False
         self._asked_s, self._ask_again_s, self._news_s = 0.0, ASKED_AGAIN_S, time.monotonic()
         self.log = self._open(folder / LOG_NAME, config)
 
@@ -117,8 +119,9 @@ class Recorder:
             path.rename(before)
         path.unlink(missing_ok=True)
         try:
+            awaited = NAME in config.bus.wait_for and not config.bus.live  # the run of a live camera ends at any time
             log = RunLog(path, world=config.bus.world, configuration=config.model_dump_json(indent=2),
-                         metadata=describe(config, self._run))
+                         metadata=describe(config, self._run) | (to_be_finished() if awaited else {}))
             if before.exists():
                 self._copy(before, log)
                 before.unlink()
@@ -139,6 +142,8 @@ class Recorder:
                 if run != self._run:
                     raise SaccadeError(f"log {log.path} is there already, of the run {run}: move it away")
                 self._write(log, topic, part, payload, self._checked(topic, part, payload), time_ns)
+            if FINISHED in reader.metadata:
+                self._finish(log, reader.metadata[FINISHED].get("episodes", ""))
         log.flush()
 
     def _take(self, topic: Topic, part: str | None, payload: bytes) -> None:
@@ -146,7 +151,7 @@ class Recorder:
         message = self._checked(topic, part, payload)
         if message is not None and message.run == self._run and self._sequences.begins(topic, part, message):
             # A new episode begins. The last messages of the episode before may be lost, so they are asked for.
-            self._write_kept([topic], self._last[topic.name, part])
+            self._write_kept([topic], self._last.get((topic.name, part), (message.episode, 0)))
         self._write(self.log, topic, part, payload, message)
         self.health.published = self.log.messages
         self._ask_for_missing()
@@ -201,7 +206,18 @@ class Recorder:
 
     def _write(self, log: RunLog, topic: Topic, part: str | None, payload: bytes, message: Message | None,
                time_ns: int | None = None) -> None:
+        """Writes a message once. One of another run is refused, and so is one that the log does not take."""
+        if (reason := log.refusal(topic, part, payload)) is not None:
+            self._leave_out(topic, part, reason)
+            return
         if message is not None:
+            # A service has no run before its first episode, but it has a status.
+            if message.run != self._run and (topic != STATUS or message.run):
+                self.health.refuse(topic, part, f"run: it is of the run {told(message.run)}, not of "
+                                                f"{told(self._run)}, and is not recorded")
+                return
+            if isinstance(message, Status) and message.state == "finished" and message.run:
+                self._finish(log, message.episode + 1)
             if (lost := self._sequences.take(topic, part, message)) is None:
                 return
             if lost and time_ns is None:  # the missing ones come first, so that the log is in order
@@ -210,6 +226,33 @@ class Recorder:
                 key = topic.name, part
                 self._last[key] = max(self._last.get(key, (0, 0)), (message.episode, message.step))
         log.write(topic, part, payload, sequence=message.seq if message else 0, log_time_ns=time_ns)
+
+
+    def _leave_out(self, topic: Topic, part: str | None, reason: str) -> None:
+        """Counts a message that the log does not take, and names the first for each reason."""
+        if reason in self._left_out:
+            self.health.refused += 1
+            return
+        self._left_out.add(reason)
+        self.health.refuse(topic, part and printable(part, NAME_LIMIT), f"{reason}: more is not recorded")
+        print(f"saccade: {NAME}: {self.health.note}", file=sys.stderr, flush=True)
+
+    def _finish(self, log: RunLog, episodes: int | str) -> None:
+        """Notes in the log that the source has finished."""
+        if not self._finished:
+            self._finished = True
+            log.note(FINISHED, {"episodes": episodes})
+
+
+def complete(folder: Path, config: Config) -> None:
+    """Gives the log in a run's folder its end, if a recorder was killed before it could: every whole message once, and
+    an index. What the log lacks is not asked for, so no bus is needed. Raises SaccadeError if it cannot be written."""
+    Recorder(LocalBus(), folder, config).log.close()
+
+
+def to_be_finished() -> dict[str, dict[str, str]]:
+    """Metadata of the log of a run whose source says when it is over. `saccade log check` then asks whether it did."""
+    return {AWAITED: {FINISHED: "when the source has finished its last episode"}}
 
 
 def describe(config: Config, run: str) -> dict[str, dict[str, str]]:

@@ -7,25 +7,32 @@ import json
 import os
 import time
 import typing
+import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 from mcap.data_stream import RecordBuilder
-from mcap.records import DataEnd, Footer, Metadata
+from mcap.records import Channel, DataEnd, Footer, Metadata
 from mcap.writer import MCAP0_MAGIC, Writer
 
 from saccade.shared.bus.messages import ArraySpec, Message, field_types
-from saccade.shared.bus.topics import Topic
+from saccade.shared.bus.topics import Topic, parse_key
 from saccade.shared.bus.wire import ARRAY_EXTENSION
 from saccade.shared.errors import SaccadeError
 from saccade.shared.log.migrations import FORMAT
+from saccade.shared.log.records import MAX_PAYLOAD_BYTES
 
 FLUSH_S = 0.4  # a chunk is closed this often: what a killed recorder may lose
 CONFIGURATION = "config.json"
 ENDED_EARLY = "ended_early"
 LOG = "log"  # metadata about the log itself: its format
 CUT = "cut"  # metadata of a log that does not begin with step 0, or is a part of another: which steps it has
+AWAITED = "awaited"  # metadata of the log of a run that says when it is over: that it has to say so
+FINISHED = "finished"  # metadata of the log of a run whose source has said that it is over: how many episodes it had
+KEY = "key"  # metadata, one of each key: its channel once more, outside of the chunks, should its chunk be damaged
+MOST_KEYS = 4096  # of a log; MCAP has numbers for 65,535
+LONGEST_KEY = 256
 
 
 class RecordingStopped(SaccadeError):
@@ -56,11 +63,30 @@ class RunLog:
 
     def write(self, topic: Topic, part: str | None, payload: bytes, *, sequence: int = 0,
               log_time_ns: int | None = None) -> None:
-        """Appends wire bytes, at the time of their arrival (now unless given)."""
+        """Appends wire bytes, at the time of their arrival (now unless given). What the log does not take (`refusal`)
+        is left out."""
         if self._writer is not None:
             now_ns = time.time_ns() if log_time_ns is None else log_time_ns
-            self._guarded(self._add, self._writer, topic, part, payload, sequence, now_ns)
+            if self.refusal(topic, part, payload) is None:
+                self._guarded(self._add, self._writer, topic, part, payload, sequence, now_ns)
             self.flush_if_due()
+
+    def refusal(self, topic: Topic, part: str | None, payload: bytes) -> str | None:
+        """Why the log does not take such a message; None where it does."""
+        key = topic.key(self._world, part)
+        if key not in self._channels:
+            if len(self._channels) >= MOST_KEYS:
+                return f"a log takes {MOST_KEYS} keys at most"
+            if len(key) > LONGEST_KEY or not key.isprintable():
+                return f"a log takes keys of at most {LONGEST_KEY} printable characters"
+        if len(payload) > MAX_PAYLOAD_BYTES:
+            return f"a log takes messages of at most {MAX_PAYLOAD_BYTES} bytes"
+        return None
+
+    def note(self, name: str, values: Mapping[str, object]) -> None:
+        """Adds metadata."""
+        if self._writer is not None:
+            self._guarded(self._writer.add_metadata, name, {k: str(v) for k, v in values.items()})
 
     def flush_if_due(self) -> None:
         """To be called at least every FLUSH_S seconds while nothing is written."""
@@ -118,7 +144,9 @@ class RunLog:
             if name not in self._schemas:
                 text = json.dumps(json_schema(topic.type), sort_keys=True).encode()
                 self._schemas[name] = writer.register_schema(name, "jsonschema", text)
-            self._channels[key] = writer.register_channel(key, "msgpack", self._schemas[name])
+            channel = self._channels[key] = writer.register_channel(key, "msgpack", self._schemas[name])
+            writer.add_metadata(KEY, key_metadata(channel, key))
+        log_time_ns = min(max(log_time_ns, 0), 2 ** 63 - 1)
         writer.add_message(self._channels[key], log_time_ns, payload, log_time_ns, sequence % 2 ** 32)
         self.messages += 1
 
@@ -170,6 +198,23 @@ class _WholeRecords:
 
     def close(self) -> None:
         self._raw.close()
+
+
+def key_metadata(channel: int, key: str) -> dict[str, str]:
+    """The metadata KEY of a channel. It has a sum of its own: MCAP has none for what is outside of chunks."""
+    return {"channel": str(channel), "key": key, "crc32": str(zlib.crc32(f"{channel} {key}".encode()))}
+
+
+def channel_of(values: Mapping[str, str]) -> Channel | None:
+    """The channel that the metadata KEY tells of, without its schema; None where it is not as it was written."""
+    channel, key = values.get("channel", ""), values.get("key", "")
+    if not channel.isdecimal() or values != key_metadata(int(channel[:6]), key):
+        return None
+    try:
+        parse_key(key)
+    except SaccadeError:
+        return None
+    return Channel(id=int(channel), topic=key, message_encoding="msgpack", metadata={}, schema_id=0)
 
 
 def json_schema(message_type: type[Message]) -> dict[str, Any]:
