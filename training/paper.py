@@ -43,6 +43,7 @@ class PaperCcnTask(CcnTask):
         return {"ccn": CCN("paper")}
 
     def loss(self, step: int) -> tuple[Tensor, dict[str, float]]:
+        """The loss at a step, and its parts."""
         generator = self.generator(step)
         pair = sample_pair(self.composer, self.train_index, self.config.batch_ccn, generator)
         with torch.autocast(self.device.type, dtype=torch.bfloat16):
@@ -71,12 +72,14 @@ class PaperExtractionTask:
         self.lambdas: list[float] = []
 
     def generator(self, *key: int) -> torch.Generator:
+        """The random generator of this part for a key, see `generator_of`."""
         return generator_of(self.config, self.part, self.device, *key)
 
     def _pick(self, index: Tensor, count: int, generator: torch.Generator) -> Tensor:
         return index[torch.randint(len(index), (count,), generator=generator, device=self.device)]
 
     def loss(self, step: int) -> tuple[Tensor, dict[str, float]]:
+        """The loss at a step, and its parts."""
         generator, count = self.generator(step), self.config.batch_extraction
         first, second = (self._pick(self.train_index, count, generator) for _ in range(2))
         batch, clean = self.frames.compose(second, generator), self.clean.clean(second)
@@ -103,12 +106,14 @@ class PaperExtractionTask:
 
     @torch.inference_mode()
     def evaluate(self) -> dict[str, float]:
+        """Errors of the networks on images of held-out directions that are always the same, see `errors`."""
         generator = self.generator(2 ** 31)
         batch = self.frames.compose(self._pick(self.held_out, EVALUATED, generator), generator)
         _, center, scale, _, logit = self.module(batch.image)
         return errors(logit[:, None], (center[:, None] + 1) / 2, scale.log()[:, None], batch)
 
     def draw(self, path: Path) -> None:
+        """Saves sample pictures of held-out directions."""
         generator = self.generator(2 ** 31)
         chosen = self._pick(self.held_out, 8, generator)
         draw_paper_extraction(path, self.module, self.frames.compose(chosen, generator), self.clean.clean(chosen))

@@ -50,9 +50,9 @@ def reach(goal: ArrayLike, spheres: Spheres, start: ArrayLike) -> Array:
 
     After an action `clip` pushes the camera out of one sphere after another. A sphere pushes every point on a ray from
     its centre to the same point of its surface, and this point may lie inside an earlier sphere. So a goal inside one
-    sphere can be reached by a command that lies deep inside another one. Commands that use two such pushes are tried as
-    well. A position outside all spheres is preferred unless another one comes nearer
-    by more than 1 cm. Commands beyond the limit of an action are not used.
+    sphere can be reached by a command that lies deep inside another one. Commands that use two such pushes are tried
+    too. A position outside all spheres is preferred unless another command comes nearer by more than 1 cm. Commands
+    beyond the limit of an action are not used.
     """
     goal = np.asarray(goal, dtype=np.float64)
     commands = goal[None]

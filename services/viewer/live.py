@@ -88,6 +88,7 @@ class _Feed:
         self._sequences = Sequences()
 
     def take(self, topic: Topic, part: str | None, payload: bytes) -> None:
+        """Decodes a message and passes it on, unless it is not valid or has been passed on before."""
         self._health.received += 1
         with suppress(MessageError):  # the services that compute with the message count it as refused
             message = decode(topic.type, payload)
