@@ -17,6 +17,7 @@ import pytest
 from saccade.app.log.check import missing
 from saccade.deploy.zenoh.access import access_control, declared, users
 from saccade.deploy.zenoh.make import make
+from saccade.shared.bus.topics import TOPICS
 from saccade.shared.errors import SaccadeError
 
 ADDRESS, OTHER = "10.199.7.1", "10.199.7.2"
@@ -40,6 +41,57 @@ bus.subscribe([TOPICS[sys.argv[2]]], lambda topic, part, payload: print("heard",
 print("listens", flush=True)
 time.sleep(60)
 """
+EVERYTHING = """
+import json, sys, time
+from pathlib import Path
+from saccade.shared.bus.outbox import Kept
+from saccade.shared.bus.topics import TOPICS
+from saccade.shared.bus.transport import ZenohBus
+from saccade.shared.bus.wire import encode
+from saccade.tests.samples import sample
+endpoint, me, everyone, folder = sys.argv[1], sys.argv[2], sys.argv[3].split(), Path(sys.argv[4])
+bus, told, answered, met = ZenohBus(endpoint, world="table", timeout_s=10), set(), set(), {}
+def payload(topic):
+    return encode(sample(topic.type, run=me))
+def parts(topic):
+    return everyone if topic.name == "status" else ["mug"] if topic.parts else [None]
+def take(topic, part, payload):
+    told.add((topic.name, part, payload.decode("latin1").split("run")[1][1:].split(chr(0xa7))[0]))
+def meet(name):
+    return lambda members: met.update({name: sorted(members)})
+for topic in TOPICS.values():
+    bus.subscribe([topic], take)
+bus.subscribe(None, take)
+bus.answer(TOPICS.values(), lambda topics, since, limit: [
+    Kept(topic, part, payload(topic), (me, 0, 0), 1) for topic in topics for part in parts(topic)])
+for name in everyone:
+    bus.join(name, me, meet(name))
+def together(word):
+    (folder / f"{me} {word}").touch()
+    while len(list(folder.glob(f"* {word}"))) < len(everyone):
+        time.sleep(0.1)
+    time.sleep(1.0)
+together("is there")
+for topic in TOPICS.values():
+    for part in parts(topic):
+        bus.publish(topic, part, payload(topic))
+for kept in bus.recall(TOPICS.values()):
+    answered.add((kept.topic.name, kept.part, kept.at[0]))
+together("has spoken")
+said = json.dumps({"told": list(told), "answered": list(answered), "met": met})  # as long as everyone is there
+together("is done")
+print(said)
+bus.close()
+"""
+# What is meant, written down once more: who publishes what beside its own status, and who reads what
+SAYS = {"simulator": {"frame", "goal", "truth"}, "camera": {"frame", "goal"}, "perception": {"percept", "goal_percept"},
+        "belief": {"belief"}, "planner": {"plan", "action"}, "evaluator": {"result"}, "recorder": set(),
+        "director": set(), "viewer": set()}
+SEEN = {"frame", "goal", "percept", "belief", "plan", "truth", "result", "status"}
+HEARS = {"simulator": {"action", "result", "status"}, "camera": {"action", "status"},
+         "perception": {"frame", "goal", "percept", "goal_percept"}, "belief": {"percept", "goal_percept"},
+         "planner": {"belief", "goal_percept"}, "evaluator": {"truth"}, "recorder": set(TOPICS), "viewer": SEEN,
+         "director": {"frame", "truth", "plan", "belief", "status", "result"}}
 ROUTER = """
 import sys, time
 from saccade.shared.bus.transport import ZenohBus
@@ -133,9 +185,46 @@ def test_only_who_is_known_gets_in_and_says_only_what_it_may(hosts, tmp_path):
     assert heard(curious) == []
 
 
+def test_a_valid_user_is_heard_and_told_no_more_than_its_service_declares(hosts, tmp_path):
+    """Every user publishes every message of everybody, answers every question, subscribes to and asks for all there is,
+    and joins every group: with its own password and certificate, on either host."""
+    assert "listens" in hosts.start(0, "router", "-c", ROUTER, ENDPOINT).stdout.readline()
+    assert set(SAYS) == set(HEARS) == set(users())
+    members = {user: user for user in users()} | {"perception-2": "perception"}
+    (tmp_path / "meet").mkdir()
+    started = {me: hosts.start(k % 2, user, "-c", EVERYTHING, ENDPOINT, me, " ".join(members), str(tmp_path / "meet"))
+               for k, (me, user) in enumerate(members.items())}
+    said = {me: process.communicate(timeout=120)[0] for me, process in started.items()}
+    found = {me: json.loads(text.splitlines()[-1]) for me, text in said.items()}
+    for me, user in members.items():
+        others = {other: who for other, who in members.items() if other != me}
+        wanted = {(topic, "mug" if TOPICS[topic].parts else None, other)
+                  for other, who in others.items() for topic in SAYS[who] & HEARS[user]}
+        statuses = {("status", who, other) for other, who in others.items() if "status" in HEARS[user]}
+        for way, known in (("told", wanted | statuses), ("answered", wanted)):  # nobody is asked for old statuses
+            # its own it hears without the router
+            assert {(topic, part, by) for topic, part, by in found[me][way] if by != me} == known, (me, way)
+        assert {name: set(there) - {me} for name, there in found[me]["met"].items()} == {
+            name: {other for other, who in others.items() if who == user == name} for name in members}, me
+
+
+def test_a_password_alone_and_a_certificate_alone_are_nobodys(hosts, tmp_path):
+    """A valid user with the password of another, or with the certificate of another."""
+    assert "listens" in hosts.start(0, "router", "-c", ROUTER, ENDPOINT).stdout.readline()
+    simulator = hosts.hear(0, "simulator", "action")
+    planner, belief = (json.loads((hosts.folder / f"{user}.json5").read_text())["transport"]
+                       for user in ("planner", "belief"))
+    for name, link, auth in (("password", belief["link"], planner["auth"]),
+                             ("certificate", planner["link"], belief["auth"])):
+        (tmp_path / f"{name}.json5").write_text(json.dumps({"transport": {"link": link, "auth": auth}}))
+        hosts.say(1, tmp_path / f"{name}.json5", "action", f"stolen-{name}")
+    assert hosts.say(1, "planner", "action", "planner") == ""
+    assert heard(simulator) == ["planner"]
+
+
 def test_an_agent_runs_across_two_hosts(hosts, tmp_path):
-    here, there = ("router", "simulator", "evaluator", "recorder"), ("perception", "belief", "planner")
-    runs = {"SACCADE_RUNS": str(tmp_path / "runs"), "SACCADE_WAIT": "1"}
+    here, there = ("router", "simulator", "evaluator", "recorder", "viewer"), ("perception", "belief", "planner")
+    runs = {"SACCADE_RUNS": str(tmp_path / "runs"), "SACCADE_WAIT": "1", "SACCADE_VIEW_S": "0"}
     for host, names in enumerate((here, there)):
         for name in names:
             with (tmp_path / f"{name}.log").open("w") as log:

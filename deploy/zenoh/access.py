@@ -8,7 +8,7 @@ from typing import Any
 
 from saccade.app.run.registry import AGENTS, WORLDS, service_of
 from saccade.services.viewer import SHOWN
-from saccade.shared.bus.topics import BELIEF, PLAN, RESULT, ROOT, STATUS, TRUTH, Topic
+from saccade.shared.bus.topics import BELIEF, FRAME, PLAN, RESULT, ROOT, STATUS, TRUTH, Topic
 from saccade.shared.loop.service import Service
 
 SAID = ["put", "reply"]  # messages of a service that publishes a topic
@@ -18,7 +18,7 @@ ANY = [f"{ROOT}/**"]
 MET = ["liveliness_token", "liveliness_query", "declare_liveliness_subscriber"]
 READERS: dict[str, tuple[Topic, ...] | None] = {  # have no declaration; None means every topic
     "recorder": None,
-    "director": (TRUTH, PLAN, BELIEF, STATUS, RESULT),
+    "director": (TRUTH, FRAME, PLAN, BELIEF, STATUS, RESULT),  # the frame where a camera knows no truth
     "viewer": SHOWN,
 }
 
@@ -43,13 +43,14 @@ def access_control() -> dict[str, Any]:
         rules += of_user
         policies.append({"rules": [rule["id"] for rule in of_user], "subjects": [user]})
     return {"enabled": True, "default_permission": "deny", "rules": rules, "policies": policies,
-            "subjects": [{"id": user, "usernames": [user]} for user in users()]}
+            "subjects": [{"id": user, "usernames": [user], "cert_common_names": [user]} for user in users()]}
 
 
 def _rules(user: str) -> Iterable[dict[str, Any]]:
     service = declared().get(user)
     says = [f"{ROOT}/*/{STATUS.name}/{user}", *(_key(topic) for topic in (service.outputs if service else ()))]
-    hears = [_key(topic) for topic in (_inputs(service) if service else READERS[user] or ())] or ANY
+    read = _inputs(service) if service else READERS[user]
+    hears = ANY if read is None else [_key(topic) for topic in read]
 
     def rule(what: str, messages: list[str], flow: str, keys: list[str]) -> dict[str, Any]:
         return {"id": f"{user} {what}", "messages": messages, "flows": [flow], "permission": "allow", "key_exprs": keys}
@@ -67,8 +68,10 @@ def _rules(user: str) -> Iterable[dict[str, Any]]:
 
 
 def _inputs(service: Service) -> tuple[Topic, ...]:
+    """What the main loop subscribes to and asks for. Only a source reads statuses, because only a source waits."""
     closed = (service.closed_by,) if service.closed_by else ()
-    return (*service.inputs, *closed, STATUS, *(service.outputs if service.divisible else ()))
+    statuses = (STATUS,) if service.name in {world.source for world in WORLDS.values()} else ()
+    return (*service.inputs, *closed, *statuses, *(service.outputs if service.divisible else ()))
 
 
 def _key(topic: Topic) -> str:
