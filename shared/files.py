@@ -10,8 +10,8 @@ import os
 import re
 import stat
 import tomllib
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -139,9 +139,18 @@ def writing(path: Path, what: str) -> Iterator[None]:
 
 def replace_whole(path: Path, data: bytes) -> None:
     """Writes a file that is there whole or as it was before. Raises OSError."""
-    draft = path.with_name(f"{path.name}.part")
+    replace_all(path.parent, {path.name: data})
+
+
+def replace_all(folder: Path, contents: Mapping[str, bytes]) -> None:
+    """Writes files of a folder; all of them stay as they were where one cannot be written. Raises OSError."""
+    drafts = {folder / name: folder / f"{name}.part" for name in contents}
     try:
-        draft.write_bytes(data)
-        draft.replace(path)
+        for draft, data in zip(drafts.values(), contents.values(), strict=True):
+            draft.write_bytes(data)
+        for path, draft in drafts.items():
+            draft.replace(path)
     finally:
-        draft.unlink(missing_ok=True)
+        for draft in drafts.values():
+            with suppress(OSError):
+                draft.unlink()

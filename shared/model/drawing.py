@@ -31,7 +31,7 @@ class LatentDecoder:
             make = _paper if weights.architecture == "paper" else _default
             self._linear, self._layers = make(state)
             self(np.zeros(self._linear[0][0].shape[0], np.float32))
-        except (KeyError, ValueError) as error:
+        except (KeyError, ValueError, IndexError) as error:
             raise SaccadeError(f"weights {weights.folder / name} are of another architecture: train anew") from error
 
     def __call__(self, latent: Array) -> Array:

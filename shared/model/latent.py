@@ -31,7 +31,9 @@ class LatentTransition:
             self._layers = [(np.ascontiguousarray(state[f"layers.{i}.weight"].T), state[f"layers.{i}.bias"])
                             for i in LAYERS]
             fits = all(one[0].shape[1] == other[0].shape[0] for one, other in pairwise(self._layers))
-        except (KeyError, ValueError):
+            fits &= all(weight.ndim == 2 and bias.shape == weight.shape[1:] for weight, bias in self._layers)
+            fits &= 2 * (self._layers[0][0].shape[0] - 2 - self.periodic) == self._layers[-1][0].shape[1]
+        except (KeyError, ValueError, IndexError):
             fits = False
         if not fits:
             raise SaccadeError(f"weights {weights.folder / name} are of another architecture: train anew")

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,9 +17,11 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
-from saccade.shared.errors import SaccadeError
+from saccade.shared.errors import SaccadeError, is_text, told
+from saccade.shared.files import MIB, parse_json, read_bytes, read_text, replace_all, writing
 
 if TYPE_CHECKING:
     from torch import nn
@@ -25,7 +29,9 @@ if TYPE_CHECKING:
 Architecture = Literal["default", "paper"]
 
 MANIFEST = "manifest.json"
-MAX_FILE_BYTES = 64 * 1024 * 1024
+MAX_FILE_BYTES, MAX_MANIFEST_BYTES, MAX_HEADER_BYTES = 64 * MIB, 1 * MIB, 1 * MIB
+MAX_SIDE_M, MAX_NAME = 10.0, 256
+_NEED = "get them again or train anew"
 
 
 @dataclass(frozen=True)
@@ -48,19 +54,20 @@ class Weights:
     def __init__(self, folder: Path):
         self.folder = folder
         path = folder / MANIFEST
-        if not path.is_file():
+        if not os.path.isfile(path):
             raise SaccadeError(f"weights {path} are missing: train them with `saccade train`, or name another folder")
+        text = read_text(path, "weights manifest", _NEED, MAX_MANIFEST_BYTES)
         try:
-            self.manifest = json.loads(path.read_text())
-            self.cards = tuple(ObjectCard(name, np.array(card["size_m"], dtype=np.float64), float(card["crop_side_m"]))
-                               for name, card in self.manifest["objects"].items())
-            self.hashes: dict[str, str] = dict(self.manifest["sha256"])
+            self.manifest = parse_json(text)
+            self.cards = tuple(_card(name, card) for name, card in self.manifest["objects"].items())
+            self.hashes: dict[str, str] = {_file_name(name): digest for name, digest in self.manifest["sha256"].items()}
             self.architecture: Architecture = self.manifest.get("architecture", "default")
-            self.calibration: dict[str, float] = dict(self.manifest.get("calibration", {}))
+            self.calibration: dict[str, float] = {
+                name: _positive(value, name) for name, value in self.manifest.get("calibration", {}).items()}
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise SaccadeError(f"weights manifest {path} is damaged ({error}): get it again or train anew") from error
         if self.architecture not in get_args(Architecture):
-            raise SaccadeError(f"weights manifest {path} names an unknown architecture {self.architecture!r}: "
+            raise SaccadeError(f"weights manifest {path} names an unknown architecture {told(self.architecture)}: "
                                "get a newer version of the program, or train anew")
 
     @property
@@ -80,15 +87,15 @@ class Weights:
         """Those arrays of `<stem>.safetensors` whose names begin with `prefix`, without it, after the file's hash was
         checked."""
         path = self.folder / f"{stem}.safetensors"
-        if not path.is_file():
-            raise SaccadeError(f"weights {path} are missing: get them again or train anew")
-        if path.stat().st_size > MAX_FILE_BYTES:
-            raise SaccadeError(f"weights {path} are larger than {MAX_FILE_BYTES} bytes: not ours, get them again")
-        data = path.read_bytes()
+        if not os.path.isfile(path):
+            raise SaccadeError(f"weights {path} are missing: {_NEED}")
+        data = read_bytes(path, "weights", _NEED, MAX_FILE_BYTES)
         if hashlib.sha256(data).hexdigest() != self.hashes.get(path.name):
             raise SaccadeError(f"weights {path} do not match the hash in {MANIFEST}: get them again or train anew")
-        return {key.removeprefix(prefix): array.astype(np.float32) for key, array in load(data).items()
-                if key.startswith(prefix)}
+        try:
+            return {key.removeprefix(prefix): array for key, array in _arrays(data).items() if key.startswith(prefix)}
+        except (SafetensorError, ValueError, KeyError, TypeError) as error:  # those that have the right hash, too
+            raise SaccadeError(f"weights {path} are damaged ({error}): {_NEED}") from error
 
     def fill(self, module: nn.Module, stem: str, prefix: str = "") -> nn.Module:
         """Loads `state(stem, prefix)` into a torch module and returns it."""
@@ -101,16 +108,52 @@ class Weights:
         return module.eval()
 
 
+def _arrays(data: bytes) -> dict[str, NDArray[np.float32]]:
+    """The arrays of a safetensors file in single precision. Raises ValueError and what safetensors raises."""
+    if int.from_bytes(data[:8], "little") > MAX_HEADER_BYTES:
+        raise ValueError("its header is longer than any of ours")
+    arrays = {}
+    for key, array in load(data).items():
+        if array.dtype.kind != "f":
+            raise ValueError(f"array {told(key)} is of {array.dtype}, not of floating-point numbers")
+        with np.errstate(over="ignore"):
+            arrays[key] = array.astype(np.float32)
+        if not np.isfinite(arrays[key]).all():
+            raise ValueError(f"array {told(key)} has numbers that are not finite")
+    return arrays
+
+
+def _card(name: str, card: Any) -> ObjectCard:
+    size = card["size_m"]
+    if not isinstance(size, list) or len(size) != 3:
+        raise ValueError(f"size_m of {told(name)} is not three numbers")
+    return ObjectCard(_file_name(name), np.array([_positive(side, f"size_m of {name}", MAX_SIDE_M) for side in size]),
+                      _positive(card["crop_side_m"], f"crop_side_m of {name}", MAX_SIDE_M))
+
+
+def _positive(value: Any, what: str, most: float = math.inf) -> float:
+    if not isinstance(value, int | float) or isinstance(value, bool) or not 0 < value <= most or value == math.inf:
+        raise ValueError(f"{told(what)} is {told(value)}, not a number above 0 and at most {most:g}")
+    return float(value)
+
+
+def _file_name(name: str) -> str:
+    if not name or len(name) > MAX_NAME or not is_text(name) or "/" in name or "\\" in name:
+        raise ValueError(f"{told(name)} cannot be the name of a file")
+    return name
+
+
 def write_weights(folder: Path, states: Mapping[str, Mapping[str, ArrayLike]], cards: tuple[ObjectCard, ...],
                   facts: dict[str, Any]) -> None:
-    """Writes the states in half precision and the manifest with their hashes."""
-    folder.mkdir(parents=True, exist_ok=True)
-    hashes = {}
-    for stem, state in states.items():
-        data = save({key: np.asarray(value).astype(np.float16, order="C") for key, value in state.items()})
-        (folder / f"{stem}.safetensors").write_bytes(data)
-        hashes[f"{stem}.safetensors"] = hashlib.sha256(data).hexdigest()
+    """Writes the states in half precision and the manifest with their hashes. Raises SaccadeError where that fails: the
+    weights that were there before then stay."""
+    files = {f"{stem}.safetensors": save({key: np.asarray(value).astype(np.float16, order="C")
+                                          for key, value in state.items()}) for stem, state in states.items()}
+    hashes = {name: hashlib.sha256(data).hexdigest() for name, data in files.items()}
     objects = {card.name: {"size_m": [round(float(x), 6) for x in card.size_m], "crop_side_m": card.crop_side_m}
                for card in cards}
     manifest = {**facts, "objects": objects, "sha256": hashes}
-    (folder / MANIFEST).write_text(json.dumps(manifest, indent=2) + "\n")
+    files[MANIFEST] = (json.dumps(manifest, indent=2) + "\n").encode()
+    with writing(folder, "weights"):
+        folder.mkdir(parents=True, exist_ok=True)
+        replace_all(folder, files)
