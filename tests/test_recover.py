@@ -13,13 +13,13 @@ from mcap.records import Channel, Message
 from mcap.writer import CompressionType, Writer
 
 from saccade.app.log.check import missing
-from saccade.app.log.recover import RECOVERED, recover
+from saccade.app.log.recover import recover
 from saccade.app.log.salvage import Salvage
 from saccade.shared.bus.topics import ACTION, PERCEPT
 from saccade.shared.bus.wire import encode
 from saccade.shared.errors import SaccadeError
 from saccade.shared.log.reading import RunReader
-from saccade.shared.log.recording import RecordingStopped, RunLog
+from saccade.shared.log.recording import RECOVERED, RecordingStopped, RunLog
 from saccade.tests.samples import sample
 
 CHUNKS, EACH = 5, 3

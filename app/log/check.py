@@ -11,9 +11,10 @@ from typing import NamedTuple
 
 from saccade.app.log.cut import Range, range_of
 from saccade.app.log.source import setting_of
-from saccade.shared.bus.messages import Truth
+from saccade.shared.bus.messages import Message, Truth
 from saccade.shared.bus.sequences import Sequences
-from saccade.shared.bus.topics import RESULT, TOPICS
+from saccade.shared.bus.topics import RESULT, TOPICS, Topic
+from saccade.shared.bus.wire import Stamp
 from saccade.shared.errors import printable
 from saccade.shared.log.reading import RunReader
 from saccade.shared.log.recording import AWAITED, FINISHED
@@ -92,21 +93,14 @@ def missing(path: Path) -> Missing:
     """Reads a log and reports gaps. The last step of an episode that is done needs no answer to its frame; of a log
     that was cut out of another only its range is expected. Where nobody waited (`bus.live`) no step needs an answer.
     Raises SaccadeError for a file that is no log, or damaged from its start on."""
-    report, reader, sequences, there = Missing(), RunReader(path), None, _There()
+    report, reader, sequences, there = Missing(), RunReader(path), None, There()
     for topic, part, message in reader:
         sequences = sequences or Sequences(from_start=True, cut=range_of(reader) is not None)
         report.messages += 1
-        key = topic.key(reader.world, part)
         lost = sequences.take(topic, part, message)
         report.repeated += lost is None
         report.heartbeats += 0 if topic.in_step else lost or 0
-        at = message.run, message.episode
-        if topic.latched:
-            there.held[at].add(key)
-        elif topic.in_step:
-            there.steps[at][key].add(message.step)
-            if isinstance(message, Truth) and message.done:
-                there.done[at].add(message.step)
+        there.take(topic, topic.key(reader.world, part), message)
     if not report.messages:
         reader.require_something()
     kept = range_of(reader)
@@ -121,13 +115,23 @@ def missing(path: Path) -> Missing:
     return report
 
 
-class _There:
+class There:
     """What is there of each episode: of each key the steps, what holds for all of it, and where it was done."""
 
     def __init__(self) -> None:
         self.steps: dict[tuple[str, int], dict[str, set[int]]] = defaultdict(lambda: defaultdict(set))
         self.held: dict[tuple[str, int], set[str]] = defaultdict(set)
         self.done: dict[tuple[str, int], set[int]] = defaultdict(set)
+
+    def take(self, topic: Topic, key: str, message: Message | Stamp) -> None:
+        """Notes a message, of which the stamp is enough unless it is a Truth."""
+        at = message.run, message.episode
+        if topic.latched:
+            self.held[at].add(key)
+        elif topic.in_step:
+            self.steps[at][key].add(message.step)
+            if isinstance(message, Truth) and message.done:
+                self.done[at].add(message.step)
 
     def absent(self, kept: Range | None) -> Iterator[Absent]:
         """Of each episode and key the steps that are not there, as stretches: there may be more than can be counted."""
@@ -149,7 +153,7 @@ class _There:
                     yield Absent(*episode, key, 0, 0)
 
 
-def _unfinished(reader: RunReader, there: _There) -> tuple[str | None, list[tuple[int, int]]]:
+def _unfinished(reader: RunReader, there: There) -> tuple[str | None, list[tuple[int, int]]]:
     """How far a run came that was not brought to its end, and which whole episodes are not there of one that was."""
     found = {episode for _, episode in there.steps}
     if FINISHED not in reader.metadata:

@@ -8,14 +8,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from saccade.app.log.cut import Range, range_of
-from saccade.app.log.recover import RECOVERED
 from saccade.app.log.traffic import Keys
 from saccade.shared.bus.messages import Result
 from saccade.shared.bus.sequences import Sequences
 from saccade.shared.bus.wire import MessageError, decode
 from saccade.shared.errors import printable
 from saccade.shared.log.reading import RunReader
-from saccade.shared.log.recording import AWAITED, FINISHED
+from saccade.shared.log.recording import AWAITED, FINISHED, RECOVERED
 
 LINE_LIMIT = 20_000
 SHORT = 12  # digits of a hash

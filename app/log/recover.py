@@ -19,10 +19,9 @@ from saccade.shared.errors import SaccadeError, printable
 from saccade.shared.files import opened
 from saccade.shared.log.foreign import NAME_LIMIT, describe, foreign, is_key
 from saccade.shared.log.reading import ANY_SIZE, MOST_NOTES, NEED
-from saccade.shared.log.recording import ENDED_EARLY, KEY, LOG, channel_of, json_schema, key_metadata
+from saccade.shared.log.recording import ENDED_EARLY, KEY, LOG, RECOVERED, channel_of, json_schema, key_metadata
 
 LOST_LIMIT = 20_000  # characters of what is said about it in the new file
-RECOVERED = "recovered"  # metadata of a recovered log: from which, and what was lost
 
 
 @dataclass
@@ -163,7 +162,7 @@ class Copy:
             if channel is not None:
                 self._channels.setdefault(channel.id, channel)
             return
-        if self._report.told.total() >= MOST_NOTES:
+        if self._report.told.total() >= MOST_NOTES // 2:  # the new log has some of its own
             self._report.left_out += 1
             return
         self._report.told[record.name] += 1

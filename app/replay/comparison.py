@@ -12,7 +12,8 @@ import numpy as np
 from saccade.app.replay.tolerances import IGNORED, tolerance_of
 from saccade.shared.bus.messages import Message
 from saccade.shared.bus.topics import Topic
-from saccade.shared.bus.wire import decode, stamp_of
+from saccade.shared.bus.wire import MessageError, decode, stamp_of
+from saccade.shared.errors import printable
 from saccade.shared.log.migrations import ADDED
 
 KEPT = 1_000  # at most so many differences are kept
@@ -37,7 +38,7 @@ class Difference:
 
     def __str__(self) -> str:
         where = f"{self.topic}{f'/{self.part}' if self.part else ''} episode {self.episode} step {self.step}"
-        return f"{where}: {self.field}: recorded {self.recorded}, replayed {self.replayed}"
+        return printable(f"{where}: {self.field}: recorded {self.recorded}, replayed {self.replayed}")
 
 
 @dataclass
@@ -50,6 +51,7 @@ class Comparison:
     beyond: int = 0  # pairs that differ beyond what is tolerated
     differences: list[Difference] = field(default_factory=list)
     # Called with topic, part, recorded and replayed message of every pair
+    not_compared: list[At] = field(default_factory=list)  # of steps of which a damaged log lacks a part
     on_pair: Callable[[Topic, str | None, Message, Message], None] | None = None
     _recorded: dict[At, tuple[Topic, bytes]] = field(default_factory=dict)
     _replayed: dict[At, tuple[Topic, bytes]] = field(default_factory=dict)
@@ -67,7 +69,8 @@ class Comparison:
     @property
     def equal(self) -> bool:
         """Whether nothing differs beyond what is tolerated, and no message is on one side alone."""
-        return not (self.beyond or self._recorded or self._replayed)
+        nothing = self.not_compared and not self.compared
+        return not (self.beyond or self._recorded or self._replayed or nothing)
 
     @property
     def only_recorded(self) -> list[At]:
@@ -79,6 +82,13 @@ class Comparison:
         """The messages that the recording does not have."""
         return sorted(self._replayed, key=str)
 
+    def set_aside(self, may_lack: Callable[[Topic, str | None, int, int], bool]) -> None:
+        """Moves what was said only now to `not_compared`, where the recording may have lost its twin."""
+        for at, (topic, _) in list(self._replayed.items()):
+            if may_lack(topic, *at[1:]):
+                del self._replayed[at]
+                self.not_compared.append(at)
+
     def _take(self, own: dict, other: dict, topic: Topic, part: str | None, payload: bytes) -> list[Difference]:
         stamp = stamp_of(payload)
         at = (topic.name, part, stamp.episode, stamp.step)
@@ -89,8 +99,15 @@ class Comparison:
         self.compared += 1
         if twin == payload and self.on_pair is None:
             return []
-        pair = decode(topic.type, payload), decode(topic.type, twin)
-        recorded, replayed = pair if own is self._recorded else pair[::-1]
+        new, old = (twin, payload) if own is self._recorded else (payload, twin)
+        replayed = decode(topic.type, new)
+        try:
+            recorded = decode(topic.type, old)
+        except MessageError as error:
+            self.unequal, self.beyond = self.unequal + 1, self.beyond + 1
+            invalid = Difference(*at, "message", str(error), "a valid message", float("inf"), tolerated=False)
+            self.differences += [invalid][:KEPT - len(self.differences)]
+            return [invalid]
         if self.on_pair is not None:
             self.on_pair(topic, part, recorded, replayed)
         if twin == payload:

@@ -3,7 +3,6 @@ recording."""
 
 from __future__ import annotations
 
-import json
 import threading
 import time
 from collections import deque
@@ -14,6 +13,7 @@ from pathlib import Path
 
 from saccade.app.log.cut import range_of
 from saccade.app.replay.comparison import Comparison
+from saccade.app.replay.holes import Holes, holes_of
 from saccade.app.run.launch import PROCESSES, Graph, running
 from saccade.app.run.registry import pairs_of, service_of
 from saccade.services.recorder.core import describe
@@ -23,7 +23,7 @@ from saccade.shared.bus.outbox import Outbox
 from saccade.shared.bus.topics import TOPICS, Output, Topic
 from saccade.shared.bus.transport import free_endpoint
 from saccade.shared.bus.wire import MessageError, Stamp, decode, encode, stamp_of
-from saccade.shared.config import Config, validate
+from saccade.shared.config import Config, recorded
 from saccade.shared.errors import SaccadeError
 from saccade.shared.log.folder import CONFIG_NAME, LOG_NAME
 from saccade.shared.log.reading import Recorded, RunReader
@@ -52,6 +52,7 @@ class Replay:
     outputs: Selection
     one_by_one: bool = False
     live: bool = False
+    holes: Holes = field(default_factory=Holes)
 
     @property
     def services(self) -> list[Service]:
@@ -92,8 +93,9 @@ def prepare(log: Path, into: Sequence[str], values: dict, *, pace: Pace, topics:
     def chosen(names: tuple[Topic, ...]) -> Selection:
         return Selection(names, episode=episode, start_step=start_step, end_step=end_step)
 
-    return Replay(log, ordered, config, pace, chosen(inputs), chosen(tuple(TOPICS[name] for name in sorted(made))),
-                  one_by_one, live)
+    outputs = tuple(TOPICS[name] for name in sorted(made))
+    holes = holes_of(log, inputs, outputs, config.names, live=live)
+    return Replay(log, ordered, config, pace, chosen(inputs), chosen(outputs), one_by_one, live, holes)
 
 
 def recorded_config(log: Path) -> tuple[Config, str, int]:
@@ -103,7 +105,7 @@ def recorded_config(log: Path) -> tuple[Config, str, int]:
     if first is None or reader.configuration is None:
         raise SaccadeError(f"log {log} holds no {'messages' if first is None else 'configuration'}: nothing to replay")
     kept = range_of(reader)
-    return validate(json.loads(reader.configuration), f"the log {log}"), first[2].run, kept.start if kept else 0
+    return recorded(reader.configuration, f"the log {log}"), first[2].run, kept.start if kept else 0
 
 
 def replay_here(replay: Replay, out: Path, keys: Keys, say: Callable[[str], None],
@@ -138,6 +140,7 @@ def replay_here(replay: Replay, out: Path, keys: Keys, say: Callable[[str], None
     finally:
         log.close()
     outcome.late_s = replay.pace.late_s
+    outcome.comparison.set_aside(replay.holes.may_lack)
     return outcome
 
 
@@ -171,14 +174,18 @@ def new_log(out: Path, config: Config) -> RunLog:
 
 def played(replay: Replay, keys: Keys, say: Callable[[str], None], outcome: Outcome, twins: Twins,
            may_go_on: Callable[[Stamp], bool] = lambda _stamp: True) -> Iterator[tuple[Recorded, Stamp]]:
-    """Yields the inputs when they are due. What the services said in the recording goes to the comparison."""
+    """Yields the inputs when they are due. What the services said in the recording goes to the comparison. What is no
+    valid message is left out, and so are steps that cannot be replayed."""
 
     def inputs() -> Iterator[Recorded]:
         for entry in RunReader(replay.log, sums=False).entries():
             if entry.topic in replay.outputs.topics:
-                twins.recorded(entry, replay.outputs)
-            else:
-                yield entry
+                twins.recorded(entry, replay.outputs, replay.holes)
+            elif entry.topic in replay.selection.topics:
+                with suppress(MessageError):
+                    message = decode(entry.topic.type, entry.payload)
+                    if not replay.holes.cannot_be_replayed(message.episode, message.step):
+                        yield entry
 
     for entry, stamp in play(inputs(), replay.selection, replay.pace, keys, one_by_one=replay.one_by_one,
                                may_go_on=may_go_on, say=say):
@@ -193,10 +200,15 @@ class Twins:
         self._comparison, self._lock = comparison, threading.Lock()
         comparison.on_pair = on_moved
 
-    def recorded(self, entry: Recorded, wanted: Selection) -> None:
+    def recorded(self, entry: Recorded, wanted: Selection, holes: Holes) -> None:
         """Takes an entry of the recording."""
         with suppress(MessageError), self._lock:
-            if (entry.topic, stamp_of(entry.payload)) in wanted:
+            stamp = stamp_of(entry.payload)
+            if (entry.topic, stamp) not in wanted:
+                return
+            if holes.cannot_be_replayed(stamp.episode, stamp.step):
+                self._comparison.not_compared.append((entry.topic.name, entry.part, stamp.episode, stamp.step))
+            else:
                 self._comparison.recorded(entry.topic, entry.part, entry.payload)
 
     def replayed(self, topic: Topic, part: str | None, payload: bytes) -> None:
@@ -220,6 +232,7 @@ def replay_on_bus(replay: Replay, out: Path, keys: Keys, say: Callable[[str], No
         graph.supervisor.stop()
         playing.drain()
     outcome.late_s = replay.pace.late_s
+    outcome.comparison.set_aside(replay.holes.may_lack)
     return outcome
 
 

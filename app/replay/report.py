@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -13,7 +14,8 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from saccade.app.log.check import missing
+from saccade.app.log.check import abbreviated, missing
+from saccade.app.replay.comparison import At
 from saccade.app.replay.displacement import Moved
 from saccade.app.replay.replay import Outcome, Replay, prepare, replay_here, replay_on_bus
 from saccade.app.run.display import say
@@ -137,9 +139,25 @@ def tell(replay: Replay, outcome: Outcome, console: Console) -> None:
             note(f"  {what}: {topic}{f'/{part}' if part else ''} of step {step} of episode {episode}")
         if len(only) > TOLD:
             note(f"  ... {len(only)} messages are {what}")
+    for line in not_compared(comparison.not_compared):
+        note(f"  {line}")
+    if comparison.not_compared and not comparison.compared:
+        note("  nothing could be compared: give a log that is whole")
     if replay.pace.rate is not None and outcome.late_s > 0.1:
         note(f"  the services were too slow for {replay.pace.rate:g} x: up to {outcome.late_s:.1f} s behind")
     _tell_losses(outcome, console)
+
+
+def not_compared(ats: Sequence[At]) -> Iterator[str]:
+    """A line for each episode with messages that were not compared, because the log lacks a part of their steps."""
+    steps: dict[int, set[int]] = defaultdict(set)
+    counts: dict[int, int] = defaultdict(int)
+    for _, _, episode, step in ats:
+        steps[episode].add(step)
+        counts[episode] += 1
+    for episode, of_episode in sorted(steps.items()):
+        where = f"episode {episode}, step {abbreviated(sorted(of_episode))}"
+        yield f"not compared: {counts[episode]} messages of {where}, of which the log has lost a part"
 
 
 def _tell_losses(outcome: Outcome, console: Console) -> None:

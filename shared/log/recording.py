@@ -30,6 +30,7 @@ LOG = "log"  # metadata about the log itself: its format
 CUT = "cut"  # metadata of a log that does not begin with step 0, or is a part of another: which steps it has
 AWAITED = "awaited"  # metadata of the log of a run that says when it is over: that it has to say so
 FINISHED = "finished"  # metadata of the log of a run whose source has said that it is over: how many episodes it had
+RECOVERED = "recovered"  # metadata of a recovered log: from which, and what was lost
 KEY = "key"  # metadata, one of each key: its channel once more, outside of the chunks, should its chunk be damaged
 MOST_KEYS = 4096  # of a log; MCAP has numbers for 65,535
 LONGEST_KEY = 256
