@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import io
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 from saccade.app.log.check import abbreviated, missing
 from saccade.app.log.cut import CUT, Range, cut, range_of
+from saccade.app.log.recover import recover
+from saccade.app.run.run import run as run_agent
+from saccade.services.recorder.core import to_be_finished
 from saccade.shared.bus.topics import ACTION, FRAME, GOAL, PERCEPT, RESULT, STATUS, TRUTH
 from saccade.shared.bus.wire import encode
 from saccade.shared.errors import SaccadeError
 from saccade.shared.log.migrations import FORMAT
 from saccade.shared.log.reading import RunReader
 from saccade.shared.log.recording import RunLog
+from saccade.tests.fixtures.make import CONFIG
 from saccade.tests.front_door import call, rows
 from saccade.tests.samples import sample
 
@@ -229,3 +236,42 @@ def test_export_is_wired(monkeypatch, capsys, run, tmp_path):
     code, out, _ = call(monkeypatch, capsys, "log", "export", run, "--out", tmp_path / "t", "--tables")
     assert (code, "tables written" in out) == (0, True)
     assert (tmp_path / "t" / "frame.parquet").is_file()
+
+
+def test_a_run_that_was_not_finished_is_told_by_its_exit_code_too(monkeypatch, capsys, tmp_path):
+    """Its log knows that an end was awaited, and of how many episodes. A part of it owes none."""
+    awaited = to_be_finished()
+    write(tmp_path / "a.mcap", story(1), **awaited)
+    code, out, err = call(monkeypatch, capsys, "log", "check", tmp_path / "a.mcap")
+    assert (code, err, out.count("\n")) == (1, "", 1)
+    assert out.startswith("the run was not finished: it was ended in episode 0, ")
+    assert "the run was not finished" in call(monkeypatch, capsys, "log", "info", tmp_path / "a.mcap")[1]
+    write(tmp_path / "none.mcap", [], **awaited)
+    assert "it was ended before its first step" in call(monkeypatch, capsys, "log", "check", tmp_path / "none.mcap")[1]
+    cut(tmp_path / "a.mcap", tmp_path / "c.mcap", start=2)
+    assert missing(tmp_path / "c.mcap").complete
+    recover(tmp_path / "a.mcap", tmp_path / "r.mcap")
+    assert missing(tmp_path / "r.mcap").unfinished
+    for episodes, lines in (("2", []), ("5", ["episodes that are not there: 2-4"]),
+                            (str(2 ** 62), [f"episodes that are not there: 2-{2 ** 62 - 1}"]), ("many", [])):
+        path = write(tmp_path / f"{episodes}.mcap", story(), **awaited, finished={"episodes": episodes})
+        assert list(missing(path).lines()) == lines
+
+
+def test_a_run_in_one_process_says_whether_it_was_finished(tmp_path, monkeypatch):
+    def ended_by(how, folder):
+        def local(pairs, names, run, on_message, encoded):
+            for topic, part, message in story(1):
+                if topic != STATUS:
+                    on_message(topic, part, message, encode(message))
+            if how is not None:
+                raise how
+
+        monkeypatch.setattr("saccade.app.run.run.run_local", local)
+        with pytest.raises(type(how)) if how is not None else nullcontext():
+            run_agent(CONFIG, agent="sceneccn", out=folder, plain=True, console=Console(file=io.StringIO()))
+        return missing(folder / "run.mcap")
+
+    assert ended_by(None, tmp_path / "a").complete
+    assert ended_by(KeyboardInterrupt(), tmp_path / "b").unfinished
+    assert ended_by(SaccadeError("the planner has no weights"), tmp_path / "c").unfinished

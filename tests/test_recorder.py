@@ -15,18 +15,20 @@ import numpy as np
 import pytest
 
 from saccade.app.log.check import missing
+from saccade.services.recorder.core import Recorder, complete
 from saccade.shared.bus.outbox import Outbox
 from saccade.shared.bus.topics import ACTION, GOAL, PERCEPT, RESULT, STATUS
-from saccade.shared.bus.transport import ZenohBus, free_endpoint
-from saccade.shared.bus.wire import encode
+from saccade.shared.bus.transport import LocalBus, ZenohBus, free_endpoint
+from saccade.shared.bus.wire import decode, encode
 from saccade.shared.config import Config
-from saccade.shared.log.reading import RunReader
+from saccade.shared.log.reading import RunReader, is_whole
 from saccade.shared.log.recording import RunLog
 from saccade.tests.fakes.logs import so_far
 from saccade.tests.samples import sample
 
 WAIT_S = 60
 MOST_LOST_S = 1.0  # what a killed recorder may lose
+PAYLOAD = b"no message at all"
 
 
 class RecorderProcess:
@@ -189,3 +191,65 @@ def test_a_recorder_without_room_says_so_and_the_bus_goes_on(tmp_path):
     assert error.count("\n") == 1
     reader = RunReader(tmp_path / "run" / "run.mcap")
     assert sum(e.topic == ACTION for e in reader.entries()) > 10
+
+
+def test_messages_of_another_run_are_refused_and_named(tmp_path):
+    """Also a result, with which an episode of this run would end, and a status; a service that has not begun has no
+    run yet."""
+    def said_by(run, topic, part=None, **changes):
+        return topic, part, sample(topic.type, run=run, episode=0, step=0, seq=0, **changes)
+
+    with closing(RecorderProcess(tmp_path / "run")) as recorder:
+        for topic, part, message in (said_by("run", ACTION), said_by("", STATUS, "belief"), said_by("run", RESULT)):
+            recorder.bus.publish(topic, part, encode(message))
+        recorder.until(lambda: RESULT in {t for t, _, _ in so_far(tmp_path / "run" / "run.mcap")})
+        for topic, part, message in (said_by("other", RESULT), said_by("other", ACTION), said_by("", ACTION),
+                                     said_by("other", STATUS, "planner")):
+            place = f"{topic.name}{'/planner' * bool(part)}"
+            note = f"refused: {place}: run: it is of the run '{message.run}', not of 'run'"
+            recorder.bus.publish(topic, part, encode(message))
+            recorder.until(lambda note=note: note.encode() in b"".join(recorder.said))
+        recorder.until(lambda: decode(STATUS.type, recorder.said[-1]).refused == 4)
+        recorder.process.terminate()
+        assert recorder.process.wait(WAIT_S) == 0
+    found = [(t, p, m.run) for t, p, m in RunReader(tmp_path / "run" / "run.mcap") if p != "recorder"]
+    assert found == [(ACTION, None, "run"), (STATUS, "belief", ""), (RESULT, None, "run")]
+
+
+def test_keys_without_end_are_refused_named_once_and_the_run_goes_on(tmp_path, monkeypatch):
+    """In this process: the recorder itself on a bus without a network."""
+    monkeypatch.setattr("saccade.shared.log.recording.MOST_KEYS", 5)
+    recorder = Recorder(LocalBus(), tmp_path, Config().with_values({"run": "r"}))
+    notes = []
+    monkeypatch.setattr(recorder.health, "say", lambda state=None, note=None: notes.append(note))
+    for i in range(70_000):
+        message = sample(PERCEPT.type, run="r", episode=0, step=0, seq=0, object=str(i))
+        recorder._take(PERCEPT, str(i), PAYLOAD if i > 5 else encode(message))
+    recorder._take(PERCEPT, "3", encode(sample(PERCEPT.type, run="r", episode=0, step=1, seq=1, object="3")))
+    recorder.log.close()
+    assert recorder.health.refused >= 70_000 - 5
+    assert [note for note in notes if note and "5 keys at most: more is not recorded" in note] == notes[:1]
+    steps = [(entry.part, decode(PERCEPT.type, entry.payload).step) for entry in RunReader(recorder.log.path).entries()]
+    assert steps == [*((str(i), 0) for i in range(5)), ("3", 1)]
+
+
+def test_when_the_source_has_finished_the_log_says_so(tmp_path):
+    """Also where the recorder is started once more, after the source has gone."""
+    config = Config().with_values({"run": "r", "bus.wait_for": ["planner", "recorder"]})
+    recorder = Recorder(LocalBus(), tmp_path, config)
+    recorder._take(ACTION, None, encode(sample(ACTION.type, run="r", episode=1, step=0, seq=0)))
+    for state, run in (("ready", "r"), ("finished", "other"), ("finished", "")):
+        recorder._take(STATUS, "simulator", encode(sample(STATUS.type, run=run, episode=1, seq=0, state=state)))
+    recorder.log.flush()
+    assert "the run was not finished: it was ended in episode 1" in missing(tmp_path / "run.mcap").unfinished
+    for seq in (1, 2):
+        recorder._take(STATUS, "simulator", encode(sample(STATUS.type, run="r", episode=1, seq=seq, state="finished")))
+    recorder.log.flush()
+    recorder.log._file.close()  # killed
+    assert not is_whole(tmp_path / "run.mcap")
+    complete(tmp_path, config)
+    assert is_whole(tmp_path / "run.mcap")
+    report = missing(tmp_path / "run.mcap")
+    assert (report.cut, report.unfinished, report.episodes) == (None, None, [(0, 0)])
+    assert "episodes that are not there: 0" in list(report.lines())
+    assert not report.complete

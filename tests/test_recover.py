@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import random
 import shutil
+import zlib
 from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.data_stream import RecordBuilder
 from mcap.reader import make_reader
-from mcap.records import Channel, Message
-from mcap.writer import CompressionType, Writer
+from mcap.records import Channel, Chunk, Header, Message
+from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 from saccade.app.log.check import missing
 from saccade.app.log.recover import recover
@@ -236,3 +238,50 @@ def test_a_log_whose_folder_is_moved_goes_on_there(tmp_path):
     log.flush()
     log.close()
     assert len(read(tmp_path / "elsewhere" / "run.mcap")) == 1
+
+
+@pytest.mark.parametrize("finished", [True, False])
+def test_messages_whose_key_stood_in_a_damaged_chunk_are_kept(log, tmp_path, finished):
+    """Also where the recording was not finished: there is no index that repeats the keys."""
+    path, ends, entries = log
+    data = bytearray(path.read_bytes() if finished else path.read_bytes()[:ends[-1]])
+    data[data.index(b"zstd") + 120] ^= 0xFF
+    (tmp_path / "bad.mcap").write_bytes(data)
+    report = recover(tmp_path / "bad.mcap", tmp_path / "out.mcap")
+    assert (report.nameless, report.messages) == (0, (CHUNKS - 1) * EACH)
+    assert read(tmp_path / "out.mcap") == entries[EACH:]
+    with (tmp_path / "out.mcap").open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert {schema.name for schema in summary.schemas.values()} == {"Action", "Percept"}
+    assert {channel.schema_id == 0 for channel in summary.channels.values()} == {False}
+
+
+def test_a_key_that_is_damaged_outside_of_its_chunk_is_not_taken_for_another(log, tmp_path):
+    """The chunk itself is damaged too: its messages and those that need its key are left out."""
+    path, ends, entries = log
+    data = bytearray(path.read_bytes()[:ends[-1]])
+    data[data.index(b"zstd") + 120] ^= 0xFF
+    data[data.index(b"saccade/test/action") + 18] ^= 0x01
+    (tmp_path / "bad.mcap").write_bytes(data)
+    report = recover(tmp_path / "bad.mcap", tmp_path / "out.mcap")
+    assert read(tmp_path / "out.mcap") == [entry for entry in entries[EACH:] if entry[0] == PERCEPT]
+    assert report.nameless == (CHUNKS - 1) * (EACH - 1)
+
+
+def test_a_key_that_another_chunk_has_is_found_behind_its_messages(tmp_path):
+    """Logs of other writers repeat their keys: where the first chunk is damaged, a later one tells them."""
+    key = Channel(1, "saccade/test/action", "msgpack", {}, 0)
+    payload = encode(sample(ACTION.type, run="r", episode=0, step=0, seq=0))
+    builder = RecordBuilder()
+    Header("", "x").write(builder)
+    for number, records in enumerate(([], [key])):
+        content = RecordBuilder()
+        for record in (Message(1, number, payload, number, number), *records):
+            record.write(content)
+        data = content.end()
+        Chunk(compression="", data=data, message_start_time=0, message_end_time=1, uncompressed_crc=zlib.crc32(data),
+              uncompressed_size=len(data)).write(builder)
+    (tmp_path / "a.mcap").write_bytes(MCAP0_MAGIC + builder.end())
+    report = recover(tmp_path / "a.mcap", tmp_path / "out.mcap")
+    assert (report.messages, report.nameless) == (2, 0)
+    assert [entry[3] for entry in read(tmp_path / "out.mcap")] == [0, 1]
