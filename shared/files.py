@@ -137,6 +137,20 @@ def writing(path: Path, what: str) -> Iterator[None]:
                            "place where you may write") from error
 
 
+def append_line(path: Path, line: str) -> None:
+    """Appends a line to a file, whole or not at all. Raises OSError."""
+    with path.open("ab", buffering=0) as file:
+        end = file.seek(0, os.SEEK_END)
+        rest = memoryview(f"{line}\n".encode())
+        try:
+            while rest:
+                rest = rest[file.write(rest):]
+        except OSError:
+            with suppress(OSError):
+                file.truncate(end)
+            raise
+
+
 def replace_whole(path: Path, data: bytes) -> None:
     """Writes a file that is there whole or as it was before. Raises OSError."""
     replace_all(path.parent, {path.name: data})

@@ -2,18 +2,30 @@
 
 from __future__ import annotations
 
+import io
+import json
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
+from saccade.app.bench.failures import _file_name
+from saccade.app.bench.repeat import read_results
+from saccade.app.bench.table import render
 from saccade.app.cli.texts import parse_value
+from saccade.app.run.display import Progress, line, panel, say
 from saccade.shared import files
+from saccade.shared.bus.messages import Belief, Plan, Status, Truth
+from saccade.shared.bus.topics import BELIEF, PLAN, STATUS, TRUTH
 from saccade.shared.config import MAX_FILE_BYTES, Config, load, recorded
 from saccade.shared.errors import LINE_LIMIT, SaccadeError, printable, told
 from saccade.shared.files import opened, parse_json, parse_toml, read_text
 from saccade.tests.front_door import call
 from saccade.tests.hostile import MANY, complaint, full_disk, not_files, sparse, within_limits
+from saccade.tests.samples import sample
+from saccade.tests.test_bench import record
 from saccade.tests.test_picture import write_log
 
 # Texts from outside, as they are printed.
@@ -43,6 +55,59 @@ def test_a_value_is_told_in_short_however_deep_it_is():
     assert len(told("x" * MANY)) < 300
     while deep:  # its own end would go as deep
         deep = deep.pop()
+
+
+HOSTILE = "\x1b[31m[/x]\r\x07\u202e" + "y" * 9999
+
+
+def shown(*things) -> str:
+    """What a terminal of no colours is given."""
+    console = Console(file=io.StringIO(), width=200, color_system=None)
+    for thing in things:
+        console.print(thing)
+    return console.file.getvalue()
+
+
+def test_the_display_shows_names_and_notes_that_do_nothing():
+    """Nor is anything in them markup, which would end the display."""
+    progress = Progress()
+    waiting = replace(sample(Status), service=HOSTILE, note=HOSTILE, state="failed", milliseconds=1.0)
+    progress.take(STATUS, HOSTILE, waiting)
+    before = shown(panel(progress))
+    progress.take(TRUTH, None, replace(sample(Truth), scene=HOSTILE))
+    progress.take(PLAN, None, replace(sample(Plan), target=HOSTILE, mode=HOSTILE))
+    progress.take(BELIEF, HOSTILE, replace(sample(Belief), presence=0.9))
+    text = before + shown(panel(progress))
+    console = Console(file=io.StringIO(), width=200, color_system=None)
+    say(console, line(progress))
+    say(console, HOSTILE)
+    text += console.file.getvalue()
+    assert text.replace("\n", "").isprintable()
+    assert text.count("\\x1b[31m[/x]") >= 6
+    assert len(text) < 50_000
+
+
+def test_a_table_of_results_shows_names_that_do_nothing():
+    text = shown(render([record(target=HOSTILE[:100])], title=HOSTILE))
+    assert text.replace("\n", "").isprintable()
+    assert "[/x]" in text
+
+
+def test_pictures_of_failures_stay_in_their_folder():
+    """A scene's id need not be the name of a file."""
+    assert _file_name("coffee_can-1-2100", 7) == "coffee_can-1-2100"
+    for scene in ("../../a", "a/b", "/etc/passwd", ".", "..", "x" * 250, HOSTILE):
+        assert _file_name(scene, 7) == "failed-7"
+
+
+@pytest.mark.parametrize("text", [
+    "[" * MANY, '{"results": 3}', "\0" * 99, '{"results": [{"scene": "a"}], "agent": 1}', "results of records"])
+def test_results_that_are_none_are_refused(tmp_path, text):
+    facts = {"agent": "a", "objects": "ycb", "config": {}, "weights": {}, "scenes": {}, "commit": "c", "machine": {}}
+    if text == "results of records":
+        text = json.dumps({**facts, "results": [record(scene=HOSTILE)]})
+    (tmp_path / "r.json").write_text(text)
+    assert f"results {tmp_path / 'r.json'} are not of `saccade bench`" in complaint(read_results, tmp_path / "r.json")
 
 
 # Files of any kind.

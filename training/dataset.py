@@ -12,6 +12,7 @@ import numpy as np
 from saccade.services.simulator.objects import load_mesh
 from saccade.services.simulator.views import ObjectViews, default_shells_m, render_views
 from saccade.shared.errors import SaccadeError
+from saccade.shared.files import writing
 from saccade.training.settings import TrainingConfig
 
 
@@ -33,12 +34,16 @@ def render_missing(run_dir: Path, config: TrainingConfig, progress: Callable[[st
             progress(name, done, total)
 
         views = render_views(mesh, count=config.views, progress=show)
-        path.parent.mkdir(parents=True, exist_ok=True)
         temporary = path.with_suffix(".tmp.npz")
-        np.savez_compressed(temporary, tiles=views.tiles, shells_m=np.array(views.shells_m),
-                            azimuth_rad=views.azimuth_rad, elevation_rad=views.elevation_rad,
-                            crop_side_m=views.crop_side_m, size_m=views.size_m)
-        os.replace(temporary, path)
+        with writing(path, "views"):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                np.savez_compressed(temporary, tiles=views.tiles, shells_m=np.array(views.shells_m),
+                                    azimuth_rad=views.azimuth_rad, elevation_rad=views.elevation_rad,
+                                    crop_side_m=views.crop_side_m, size_m=views.size_m)
+                os.replace(temporary, path)
+            finally:
+                temporary.unlink(missing_ok=True)
 
 
 def load_views(run_dir: Path, name: str) -> ObjectViews:

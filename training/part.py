@@ -16,11 +16,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from safetensors import SafetensorError
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from saccade.services.simulator.views import ObjectViews
 from saccade.shared.errors import SaccadeError
+from saccade.shared.files import append_line, replace_whole, writing
 from saccade.shared.log.provenance import commit
 from saccade.training.checkpoints import CHECKPOINT, ccn_of, model_of, read_checkpoint
 from saccade.training.dataset import load_views
@@ -74,7 +76,8 @@ class Trainer:
 
     def __init__(self, run_dir: Path, part: str):
         self.config, self.folder, self.part = load_settings(run_dir), run_dir / part, part
-        self.folder.mkdir(exist_ok=True)
+        with writing(self.folder, "training run"):
+            self.folder.mkdir(exist_ok=True)
         device = pick_device(self.config.device)
         views = [load_views(run_dir, name) for name in self.config.names]
         self.task = task_of(run_dir, self.config, views, part, device)
@@ -115,10 +118,10 @@ class Trainer:
         """Writes the progress and, if there are `measured` values, one line of losses.jsonl."""
         state = {"step": self.step, "steps": self.steps, "seconds": round(self.seconds, 1),
                  **{k: round(v, 4) for k, v in self.smoothed.items()}, **{k: round(v, 4) for k, v in measured.items()}}
-        (self.folder / "progress.json").write_text(json.dumps(state))
-        if measured:
-            with (self.folder / "losses.jsonl").open("a") as file:
-                file.write(json.dumps(state) + "\n")
+        with writing(self.folder, "progress"):
+            replace_whole(self.folder / "progress.json", json.dumps(state).encode())
+            if measured:
+                append_line(self.folder / "losses.jsonl", json.dumps(state))
 
     def checkpoint(self) -> None:
         """Saves networks, optimiser and counters, then evaluates and draws samples.
@@ -131,11 +134,17 @@ class Trainer:
         facts = {"step": self.step, "seconds": self.seconds, "lambdas": self.task.lambdas, "smoothed": self.smoothed,
                  "commit": self.commit}
         temporary = self.folder / "checkpoint.tmp"
-        save_file(tensors, temporary, metadata={"facts": json.dumps(facts)})
-        os.replace(temporary, self.folder / CHECKPOINT)
+        try:
+            save_file(tensors, temporary, metadata={"facts": json.dumps(facts)})
+            os.replace(temporary, self.folder / CHECKPOINT)
+        except (OSError, SafetensorError) as error:
+            temporary.unlink(missing_ok=True)
+            raise SaccadeError(f"checkpoint {self.folder / CHECKPOINT} cannot be written ({error}), the last one "
+                               "stays: free some space, and give the same command again") from error
         self.task.module.eval()
         self.report(self.task.evaluate())
-        self.task.draw(self.folder / "samples.png")
+        with writing(self.folder / "samples.png", "picture"):
+            self.task.draw(self.folder / "samples.png")
         self.task.module.train()
 
     def resume(self) -> None:

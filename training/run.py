@@ -18,6 +18,7 @@ from saccade.services.perception.paper import CROP_SIDE_M
 from saccade.services.simulator.objects import load_mesh
 from saccade.services.simulator.views import crop_side_m
 from saccade.shared.errors import SaccadeError
+from saccade.shared.files import replace_whole, writing
 from saccade.shared.model.weights import ObjectCard, write_weights
 from saccade.training.checkpoints import ccn_of, finished
 from saccade.training.dataset import render_missing
@@ -31,11 +32,13 @@ def start(run_dir: Path, config: TrainingConfig) -> TrainingConfig:
     Raises SaccadeError if the folder holds a run with other settings, or if the device is not available.
     """
     pick_device(config.device)
-    run_dir.mkdir(parents=True, exist_ok=True)
     path = run_dir / "training.json"
+    with writing(run_dir, "training run"):
+        run_dir.mkdir(parents=True, exist_ok=True)
     if path.is_file() and load_settings(run_dir) != config:
         raise SaccadeError(f"{run_dir} holds a run with other settings: continue with the same, or name another folder")
-    path.write_text(config.model_dump_json(indent=2) + "\n")
+    with writing(path, "training settings"):
+        replace_whole(path, (config.model_dump_json(indent=2) + "\n").encode())
     return config
 
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
-from saccade.shared.config import Section, checked
+from saccade.shared.config import MAX_FILE_BYTES, Section, checked
 from saccade.shared.errors import SaccadeError
+from saccade.shared.files import parse_json, read_text
 from saccade.shared.model.weights import Architecture
 
 EXTRACTION = "extraction"
@@ -98,6 +100,12 @@ def settings_from(values: dict[str, Any]) -> TrainingConfig:
 def load_settings(run_dir: Path) -> TrainingConfig:
     """Reads the settings of a run from its folder. Raises SaccadeError if there are none."""
     path = run_dir / "training.json"
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise SaccadeError(f"{path} is missing: not the folder of a training run")
-    return TrainingConfig.model_validate_json(path.read_text())
+    need = "name another folder, or remove this one to train anew"
+    text = read_text(path, "training settings", need, MAX_FILE_BYTES)
+    try:
+        tree = parse_json(text)
+    except ValueError as error:
+        raise SaccadeError(f"training settings {path} are damaged ({error}): {need}") from error
+    return checked(TrainingConfig, tree, f"training setting {{}} in {path}")

@@ -8,6 +8,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import json
+import os
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -23,6 +24,7 @@ from saccade.app.bench import table
 from saccade.app.bench.suites import default_suite, suite_file
 from saccade.app.bench.workers import in_processes
 from saccade.app.provenance import machine, shown
+from saccade.app.run.display import say
 from saccade.app.run.registry import Pair, local_pairs, weight_hashes
 from saccade.services.simulator.objects import names_in_use
 from saccade.services.simulator.scenes import Scene, load_scenes
@@ -30,9 +32,11 @@ from saccade.shared.bus.messages import Message, Result
 from saccade.shared.bus.topics import Topic
 from saccade.shared.config import Config
 from saccade.shared.errors import SaccadeError
+from saccade.shared.files import MIB, append_line, parse_json, read_text, replace_whole, writing
 from saccade.shared.log.provenance import commit
 from saccade.shared.loop.local import run_local
 
+MAX_FILE_BYTES = 256 * MIB  # of results: some hundred thousand scenes
 SCENES_ENDING = ".scenes.json"  # drawn scenes are kept in a file with this ending
 RUN = "bench"  # the run's name is part of every message, so it is always the same
 MATTERS = ("agent", "objects", "config", "weights", "scenes")  # results belong together only if these facts are equal
@@ -76,7 +80,8 @@ def prepare(agent: str, config: Config, out: Path, *, suite: str | None = None, 
     if config.scene.file is not None and suite is not None:
         raise SaccadeError("scenes come from a file or from a suite: leave --scenes or --suite out")
     names = names_in_use(config.scene)
-    out.parent.mkdir(parents=True, exist_ok=True)
+    with writing(out, "results"):
+        out.parent.mkdir(parents=True, exist_ok=True)
     path = config.scene.file
     if path is None:
         suite = suite or default_suite(config.scene.objects)
@@ -131,22 +136,23 @@ def bench(plan: Plan, *, jobs: int, command: str, console: Console, cluster: str
     done = {scene: record for scene, record in known.items() if scene in wanted}
     todo = [number for scene, number in wanted.items() if scene not in done]
     if done:
-        console.print(f"{len(done)} of {len(wanted)} scenes are done already: {plan.partial}")
+        say(console, f"{len(done)} of {len(wanted)} scenes are done already: {plan.partial}")
     try:
-        with plan.partial.open("a") as partial, _progress(console, len(wanted)) as show:
+        with _progress(console, len(wanted)) as show:
             show(list(done.values()))
             for record in _records(plan, todo, jobs, cluster):
-                partial.write(json.dumps(record) + "\n")
-                partial.flush()
+                with _kept(plan, len(done), len(wanted)):
+                    append_line(plan.partial, json.dumps(record))
                 done[record["scene"]] = record
                 show(list(done.values()))
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"the same command goes on from the {len(done)} scenes in {plan.partial}") from None
     records = [done[scene] for scene in wanted]
-    _finish(plan, origin, records)
+    with _kept(plan, len(done), len(wanted)):
+        _finish(plan, origin, records)
     where = f"{plan.config.scene.objects}, {plan.suite or plan.file.name}"
     console.print(table.render(records, title=f"{plan.agent} on {where}, {len(records)} scenes"))
-    console.print(f"written to {plan.out}")
+    say(console, f"written to {plan.out}")
     return records
 
 
@@ -154,33 +160,50 @@ def _take_up(plan: Plan, origin: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """Returns the records that an interrupted run has kept, by scene, and appends this run's header. Raises
     SaccadeError if they belong to another run."""
     # A last line that was cut is dropped
-    lines = plan.partial.read_text().split("\n")[:-1] if plan.partial.is_file() else []
+    there = os.path.lexists(plan.partial)
+    need = "delete it to start anew, or give another --json"
+    text = read_text(plan.partial, "results", need, MAX_FILE_BYTES) if there else ""
     records = {}
-    for line in lines:
-        try:
-            entry = json.loads(line)
-        except ValueError:  # a line that an earlier crash has cut
-            continue
-        if "facts" not in entry:
+    for line in text.split("\n")[:-1]:
+        entry = _entry(line)
+        if isinstance(facts := entry.get("facts"), dict):
+            for key in MATTERS:
+                if facts.get(key) != origin[key]:
+                    raise SaccadeError(f"{plan.partial} holds results of another run (its {key} differ): {need}")
+        elif entry.keys() >= set(RECORD_KEYS) and isinstance(entry["scene"], str):
             records[entry["scene"]] = entry
-            continue
-        for key in MATTERS:
-            if entry["facts"].get(key) != origin[key]:
-                raise SaccadeError(f"{plan.partial} holds results of another run (its {key} differ): "
-                                   "delete it to start anew, or give another --json")
-    with plan.partial.open("a") as partial:
-        partial.write(("\n" if lines or plan.partial.stat().st_size else "") + json.dumps({"facts": origin}) + "\n")
+    with _kept(plan, len(records), len(plan.chosen)):
+        append_line(plan.partial, ("\n" if text else "") + json.dumps({"facts": origin}))
     return records
+
+
+def _entry(line: str) -> dict[str, Any]:
+    """What a line of the partial file says; nothing where an earlier crash has cut it."""
+    try:
+        entry = parse_json(line)
+    except ValueError:
+        return {}
+    return entry if isinstance(entry, dict) else {}
+
+
+@contextmanager
+def _kept(plan: Plan, done: int, wanted: int) -> Iterator[None]:
+    """Around what writes results. Raises SaccadeError where they cannot be written, and says what is kept."""
+    try:
+        yield
+    except OSError as error:
+        kept = f"the results of {done} of {wanted} scenes are kept in {plan.partial}" if done else "none are there yet"
+        raise SaccadeError(f"results {plan.out} cannot be written ({error.strerror or error}), {kept}: free some "
+                           "space, or give a --json where you may write, and the same command again") from error
 
 
 def _finish(plan: Plan, origin: dict[str, Any], records: list[dict[str, Any]]) -> None:
     """Writes the results as one JSON object. It names every commit whose code has contributed results."""
-    lines = [line for line in plan.partial.read_text().splitlines() if line.startswith('{"facts"')]
-    commits = ", ".join(dict.fromkeys(json.loads(line)["facts"]["commit"] for line in lines))
+    entries = map(_entry, plan.partial.read_text().splitlines())
+    told = [entry["facts"] for entry in entries if isinstance(entry.get("facts"), dict)]
+    commits = ", ".join(dict.fromkeys(str(facts.get("commit")) for facts in told))
     text = json.dumps(origin | {"commit": commits, "results": records}, indent=1)
-    draft = plan.out.with_name(plan.out.name + ".draft")
-    draft.write_text(text + "\n")
-    draft.replace(plan.out)
+    replace_whole(plan.out, (text + "\n").encode())
     plan.partial.unlink()
 
 

@@ -3,6 +3,7 @@ went wrong."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,8 +16,10 @@ from rich.console import Console
 from saccade.app.bench.repeat import Again, replay
 from saccade.app.bench.workers import in_processes
 from saccade.app.look.picture import Story, draw_story
+from saccade.app.run.display import say
 from saccade.shared.bus.messages import Message, Truth
 from saccade.shared.bus.topics import Topic
+from saccade.shared.files import writing
 from saccade.shared.world.geometry import direction, rotation_angle, unit, viewing_grid
 from saccade.shared.world.task import SUCCESS_ROTATION_RAD, SUCCESS_TRANSLATION_M
 
@@ -121,7 +124,8 @@ def investigate(agent: str, config_text: str, number: int, picture: str) -> Diag
     draw_story(story, Path(picture), dpi=SMALL_DPI)
     with Image.open(picture) as drawn:
         small = drawn.convert("RGB").quantize(COLOURS, method=Image.Quantize.MAXCOVERAGE)
-    small.save(picture, optimize=True)
+    with writing(Path(picture), "picture"):
+        small.save(picture, optimize=True)
     return diagnose(story, ways)
 
 
@@ -143,14 +147,20 @@ def failed_scenes(again: Again, out: Path, *, jobs: int, console: Console) -> li
     failed = [record["scene"] for record in again.results.records if not record["success"]]
     folder = out / "failures" / again.results.path.stem
     if failed:
-        folder.mkdir(parents=True, exist_ok=True)
-    pictures = {scene: folder / f"{scene}.png" for scene in failed}
+        with writing(folder, "report"):
+            folder.mkdir(parents=True, exist_ok=True)
+    pictures = {scene: folder / f"{_file_name(scene, number)}.png" for number, scene in enumerate(failed)}
     work = {scene: (*again.arguments(scene), str(pictures[scene])) for scene in failed}
     found = {}
     for scene, diagnosis in in_processes(investigate, work, jobs):
         found[scene] = diagnosis
-        console.print(f"{len(found)} of {len(failed)}: {scene}: {CLASSES[diagnosis.cause][0].lower()}", markup=False)
+        say(console, f"{len(found)} of {len(failed)}: {scene}: {CLASSES[diagnosis.cause][0].lower()}")
     return [(found[scene], pictures[scene]) for scene in failed]
+
+
+def _file_name(scene: str, number: int) -> str:
+    """The scene's id where it can be the name of a file, else its number among those that failed."""
+    return scene if re.fullmatch(r"[\w+-][\w.+-]{0,99}", scene) else f"failed-{number}"
 
 
 def section(title: str, scenes: int, cases: Sequence[tuple[Diagnosis, str]]) -> list[str]:

@@ -4,21 +4,21 @@ same episodes."""
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from saccade.app.bench.bench import RUN, SCENES_ENDING, cores, record_of
+from saccade.app.bench.bench import MAX_FILE_BYTES, RECORD_KEYS, RUN, SCENES_ENDING, cores, record_of
 from saccade.app.bench.suites import SUITES, suite_file
 from saccade.app.look.picture import Story
 from saccade.app.run.registry import weight_hashes
-from saccade.services.simulator.scenes import Scene, load_scenes
+from saccade.services.simulator.scenes import MAX_ID, Scene, load_scenes
 from saccade.shared.bus.messages import Message
 from saccade.shared.bus.topics import Topic
 from saccade.shared.config import PACKAGE, Config, validate
-from saccade.shared.errors import SaccadeError
+from saccade.shared.errors import SaccadeError, is_text, told
+from saccade.shared.files import parse_json, read_text
 from saccade.shared.loop.local import run_local
 
 TOLD_AT_MOST = 2  # a label names at most so many settings; with more it has the file's name instead
@@ -54,13 +54,14 @@ class Results:
 
 def read_results(path: Path) -> Results:
     """Reads a results file. Raises SaccadeError if it is not one of `saccade bench`, or if it holds no result."""
+    text = read_text(path, "results", "give a file that `saccade bench` has written", MAX_FILE_BYTES)
     try:
-        tree = json.loads(path.read_text())
+        tree = parse_json(text)
         records, facts = tree["results"], {key: tree[key] for key in FACTS}
         if not records:
             raise ValueError("no result is in it")
-    except OSError as error:
-        raise SaccadeError(f"results {path} cannot be read: {error.strerror}") from error
+        for record in records:
+            _check(record)
     except (ValueError, KeyError, TypeError) as error:
         raise SaccadeError(f"results {path} are not of `saccade bench` ({error}): give a file that it has written"
                            ) from error
@@ -68,6 +69,15 @@ def read_results(path: Path) -> Results:
     scenes = facts["scenes"].get("suite") or facts["scenes"]["file"]
     label = ", ".join((facts["agent"], facts["objects"], scenes, *(told if len(told) <= TOLD_AT_MOST else [path.stem])))
     return Results(path, facts, records, label)
+
+
+def _check(record: dict[str, Any]) -> None:
+    """Raises ValueError for a record that lacks something, or whose names cannot be told."""
+    if missing := sorted(set(RECORD_KEYS) - record.keys()):
+        raise ValueError(f"a result has no {missing[0]}")
+    for key in ("scene", "target"):
+        if not isinstance(record[key], str) or not is_text(record[key]) or len(record[key]) > MAX_ID:
+            raise ValueError(f"the {key} {told(record[key])} of a result is no name")
 
 
 def told_otherwise(base: dict[str, Any], other: dict[str, Any]) -> list[str]:

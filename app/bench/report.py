@@ -31,6 +31,7 @@ from saccade.app.run.display import say
 from saccade.app.run.threads import enforce_one_thread
 from saccade.shared.config import validate
 from saccade.shared.errors import SaccadeError
+from saccade.shared.files import replace_whole, writing
 from saccade.shared.model.weights import Weights
 
 ORACLE = "oracle"
@@ -46,7 +47,8 @@ def report(paths: Sequence[Path], out: Path, *, failures: bool = False, reruns: 
     if not paths:
         raise SaccadeError("no results are given: name files that `saccade bench` has written")
     files = labelled([read_results(path) for path in paths])
-    (out / FOLDER).mkdir(parents=True, exist_ok=True)
+    with writing(out, "report"):
+        (out / FOLDER).mkdir(parents=True, exist_ok=True)
     lines = ["# Results", "", *origins(files), *success_and_errors(files), *side_by_side(files), *plots(files, out),
              *conduct(files), *training(files)]
     with tempfile.TemporaryDirectory() as folder:
@@ -283,5 +285,6 @@ def _failed(file: Results, ready: Again | SaccadeError, out: Path, jobs: int, co
 
 
 def _write(path: Path, lines: Sequence[str], console: Console) -> None:
-    path.write_text("\n".join(lines).rstrip("\n") + "\n")
+    with writing(path, "report"):
+        replace_whole(path, ("\n".join(lines).rstrip("\n") + "\n").encode())
     say(console, f"written to {path}")

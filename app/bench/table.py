@@ -9,6 +9,9 @@ from statistics import fmean, quantiles, stdev
 from typing import Any
 
 from rich.table import Table
+from rich.text import Text
+
+from saccade.shared.errors import printable
 
 Record = Mapping[str, Any]
 
@@ -134,7 +137,7 @@ def render(records: Sequence[Record], *, title: str) -> Table:
     caption += "false: of all scenes"
     if spent := milliseconds(records):
         caption += "\nmilliseconds per step: " + ", ".join(f"{name} {ms:.1f}" for name, ms in spent.items())
-    table = Table(title=title, caption=caption, show_lines=True)
+    table = Table(title=Text(printable(title), style="table.title"), caption=caption, show_lines=True)
     for header in ("target", "", "n"):
         table.add_column(header)
     for header in ("success (%)", *MEASURES.values(), "median steps", "declared"):
@@ -145,7 +148,7 @@ def render(records: Sequence[Record], *, title: str) -> Table:
         rightly = "-" if row.declared_true is None else f"{100 * row.declared_true:.0f} %"
         declared = f"{100 * row.declared:.0f} %\nrightly {rightly}\nfalse {100 * row.false_alarms:.0f} %"
         steps = f"{row.median_steps:g}\n{row.middle_steps[0]:g} to {row.middle_steps[1]:g}"
-        table.add_row(row.name, labels, str(row.scenes), *_cells(row, paper), steps, declared,
+        table.add_row(Text(printable(row.name)), labels, str(row.scenes), *_cells(row, paper), steps, declared,
                       style="bold" if row.name == TOTAL else "")
     return table
 

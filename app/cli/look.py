@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Annotated
 
@@ -45,6 +46,8 @@ def view(*, log: Annotated[Path | None, RUN] = None,
         raise SaccadeError("--save is for a log: a run that goes on is being logged already")
     if not live and (run is not None or endpoint is not None):
         raise SaccadeError("--run and --endpoint are for a run that goes on: add --live, or leave them out")
+    if save is not None:
+        os.environ.setdefault("RUST_LOG", "off")  # what goes wrong in Rerun is said in one line of ours
     from saccade.app.look.view import view_live, view_log
 
     if log is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import signal
 import sys
 from typing import Annotated
@@ -10,9 +11,11 @@ import typer
 
 from saccade.app.cli import bench, log, look, replay, run, train
 from saccade.app.run.threads import prefer_one_thread
-from saccade.shared.errors import SaccadeError
+from saccade.shared.errors import LINE_LIMIT, SaccadeError, printable
 
 EXIT_ERROR, EXIT_INTERRUPTED = 2, 130
+MENDABLE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO, errno.ENAMETOOLONG,
+            errno.EMFILE, errno.ENFILE)
 
 app = typer.Typer(name="saccade", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 
@@ -55,11 +58,19 @@ def main() -> None:
     except SaccadeError as error:
         print(f"saccade: {error}", file=sys.stderr)
         sys.exit(EXIT_ERROR)
+    except OSError as error:  # of a place or a machine that has no more; others are faults of ours
+        if error.errno not in MENDABLE:
+            raise
+        where = f"{error.filename}: " if error.filename else ""
+        told = printable(f"{where}{error.strerror}: free some space, or name another place", LINE_LIMIT)
+        print(f"saccade: {told}", file=sys.stderr)
+        sys.exit(EXIT_ERROR)
     except SystemExit as error:
         if error.code == EXIT_INTERRUPTED:
             signal.signal(signal.SIGINT, signal.SIG_IGN)  # once more would break into the interpreter's end
             reason = getattr(error.__context__, "__cause__", None)
-            print(f"saccade: interrupted{f': {reason}' if str(reason or '') else ''}", file=sys.stderr)
+            print(f"saccade: interrupted{f': {printable(str(reason), LINE_LIMIT)}' if str(reason or '') else ''}",
+                  file=sys.stderr)
         raise
 
 

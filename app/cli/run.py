@@ -74,5 +74,7 @@ def run(*, objects: Objects = None, names: Names = None, scenes: ScenesFile = No
             say(console, f"to be seen at {url_of(finished.config.viewer)} until Ctrl-C")
             stay(finished.is_viewed)
 
-    run_agent(configured(config, given, values), agent=agent, out=out, plain=plain, console=console, world=world,
-              view=view, after=show)
+    finished = run_agent(configured(config, given, values), agent=agent, out=out, plain=plain, console=console,
+                         world=world, view=view, after=show)
+    if finished.lacks:  # it was said when it happened
+        raise typer.Exit(2)

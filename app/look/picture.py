@@ -3,6 +3,7 @@ free energy."""
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from itertools import cycle
@@ -20,6 +21,7 @@ from saccade.shared.bus.messages import Belief, Frame, Goal, Message, Plan, Resu
 from saccade.shared.bus.topics import BELIEF, FRAME, GOAL, PLAN, RESULT, TRUTH
 from saccade.shared.config import recorded
 from saccade.shared.errors import SaccadeError
+from saccade.shared.files import replace_whole, writing
 from saccade.shared.log.folder import LOG_NAME, PICTURE_NAME
 from saccade.shared.log.reading import RunReader
 
@@ -131,10 +133,13 @@ def new_figure(inches: tuple[float, float], dpi: int = DPI) -> Figure:
 
 def save(figure: Figure, out: Path) -> None:
     """Writes a figure. The same figure gives the same bytes. Raises SaccadeError if the file cannot be written."""
+    drawn = io.BytesIO()
     try:
-        figure.savefig(out, metadata={"Software": None})
-    except OSError as error:
-        raise SaccadeError(f"picture {out} cannot be written: {error.strerror}") from error
+        figure.savefig(drawn, format=out.suffix[1:].lower() or "png", metadata={"Software": None})
+    except ValueError as error:
+        raise SaccadeError(f"picture {out} cannot be written ({error}): let its name end in .png") from error
+    with writing(out, "picture"):
+        replace_whole(out, drawn.getvalue())
 
 
 def image(axes: Axes, rgb: NDArray[np.uint8] | None, title: str) -> None:

@@ -37,9 +37,13 @@ def view_log(path: Path, *, save: Path | None, truth: bool, port: int | None, op
     recording = rr.RecordingStream("saccade", recording_id=name)
     if save is not None:
         with whole(save) as partial:
-            recording.save(partial)
-            _show(log, recording, truth, weights)
-            recording.disconnect()
+            try:
+                recording.save(partial)
+                _show(log, recording, truth, weights)
+                recording.disconnect()
+            except RuntimeError as error:  # Rerun's, whose thread has met a full disk and does not say so
+                why = str(error) if "os error" in str(error) else f"perhaps the disk is full ({error})"
+                raise OSError(why) from error
         say(console, f"written to {save}: `rerun {save}` shows it")
         return
     with Server(_ports(Config(), port).viewer) as server, connected(recording, server):

@@ -12,16 +12,18 @@ from rich.text import Text
 
 from saccade.shared.bus.messages import Belief, Message, Plan, Result, Status, Truth
 from saccade.shared.bus.topics import BELIEF, FRAME, PLAN, RESULT, STATUS, TRUTH, Topic
+from saccade.shared.errors import LINE_LIMIT, printable
 from saccade.shared.loop.main import WAITS
 from saccade.shared.loop.process import REFUSED
 
 LINE_EVERY = 10  # in plain mode, a line is printed every so many steps
 PER_SECOND = 8
+SHORT = 80  # characters of a name in the live display
 
 
 def say(console: Console, text: str) -> None:
     """Prints a line as it is, without wrapping and without colours."""
-    console.print(text, markup=False, highlight=False, soft_wrap=True)
+    console.print(printable(text, LINE_LIMIT), markup=False, highlight=False, soft_wrap=True)
 
 
 class Progress:
@@ -99,8 +101,8 @@ def panel(progress: Progress) -> RenderableType:
     """Returns the state of a run for the live display."""
     if progress.at is None:
         waiting = sorted(f"{name} {status.state}" for name, status in progress.statuses.items())
-        return Text("starting: " + ", ".join(waiting or ["services"]))
-    scene = f"  scene {progress.truth.scene}" if progress.truth else ""
+        return Text("starting: " + printable(", ".join(waiting or ["services"])))
+    scene = f"  scene {printable(progress.truth.scene, SHORT)}" if progress.truth else ""
     head = Text("episode {}  step {}".format(*progress.at) + scene, style="bold")
     return Group(head, _plan_table(progress), _belief_table(progress), _status_line(progress))
 
@@ -112,7 +114,8 @@ def _plan_table(progress: Progress) -> Table:
                       f"{_metres(progress.believed_distance_m)} as believed")
     if (plan := progress.plan) is not None:
         x, y, z = plan.viewpoint[:3, 3]
-        table.add_row("viewpoint", f"({x:.2f}, {y:.2f}, {z:.2f}) m", f"{plan.mode} {plan.target}".strip())
+        aim = Text(printable(f"{plan.mode} {plan.target}".strip(), SHORT))  # in a text nothing is markup
+        table.add_row("viewpoint", f"({x:.2f}, {y:.2f}, {z:.2f}) m", aim)
         table.add_row("G", f"{plan.g:.2f} nats", f"position {plan.g_position:.2f}  scale {plan.g_scale:.2f}  "
                       f"pose {plan.g_pose:.2f}  information {plan.g_information:.2f}")
     return table
@@ -126,17 +129,17 @@ def _belief_table(progress: Progress) -> RenderableType:
         table.add_column(header, justify="left" if header == "object" else "right")
     for name, belief in sorted(progress.beliefs.items()):
         x, y, z = belief.mean_m
-        table.add_row(name, f"{belief.presence:.2f}", f"{x:.2f}, {y:.2f}, {z:.2f}", f"{spread_cm(belief):.1f}",
-                      str(belief.views), style="" if belief.presence > 0.5 else "dim")
+        table.add_row(Text(printable(name, SHORT)), f"{belief.presence:.2f}", f"{x:.2f}, {y:.2f}, {z:.2f}",
+                      f"{spread_cm(belief):.1f}", str(belief.views), style="" if belief.presence > 0.5 else "dim")
     return table
 
 
 def _status_line(progress: Progress) -> Text:
     busy = [f"{name} {status.milliseconds:.0f} ms" + (f" ({status.skipped} skipped)" if status.skipped else "")
             for name, status in sorted(progress.statuses.items()) if status.milliseconds > 0]
-    notes = [f"{name}: {status.note}" for name, status in sorted(progress.statuses.items())
+    notes = [printable(f"{name}: {status.note}") for name, status in sorted(progress.statuses.items())
              if status.refused or status.state in ("failed", "not recording")]
-    return Text("  ".join(busy) + "".join(f"\n{note}" for note in notes), style="dim")
+    return Text(printable("  ".join(busy), LINE_LIMIT) + "".join(f"\n{note}" for note in notes), style="dim")
 
 
 def _metres(distance_m: float | None) -> str:

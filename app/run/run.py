@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import threading
@@ -26,7 +27,8 @@ from saccade.services.viewer.server import binary, url_of, with_free_ports
 from saccade.shared.bus.messages import Message, Result
 from saccade.shared.bus.topics import Topic
 from saccade.shared.config import Config
-from saccade.shared.errors import SaccadeError
+from saccade.shared.errors import SaccadeError, is_text
+from saccade.shared.files import writing
 from saccade.shared.log.folder import CONFIG_NAME, LOG_NAME
 from saccade.shared.log.recording import FINISHED, RecordingStopped, RunLog
 from saccade.shared.loop.local import run_local
@@ -36,13 +38,14 @@ MANIFEST_NAME = "manifest.json"
 
 @dataclass(frozen=True)
 class Finished:
-    """A run that is over: its resolved configuration, its folder, how its episodes ended, and whether its viewer still
-    shows it."""
+    """A run that is over: its resolved configuration, its folder, how its episodes ended, whether its viewer still
+    shows it, and why its log lacks a part, if it was written by this process and lacks one."""
 
     config: Config
     folder: Path
     results: list[Result]
     is_viewed: Callable[[], bool]
+    lacks: tuple[str, ...] = ()
 
 
 def run(config: Config, *, agent: str, out: Path | None, plain: bool, console: Console | None = None,
@@ -62,6 +65,7 @@ def run(config: Config, *, agent: str, out: Path | None, plain: bool, console: C
         config = to_be_viewed(config)
     processes = agent_processes(agent, world, view=view) if config.bus.kind == "zenoh" else ()
     folder = _new_folder(out or Path("runs") / f"{time.strftime('%Y%m%d-%H%M%S')}-{config.seed}")
+    lacks: list[str] = []
     ended = None  # stays None if the run is interrupted: then no viewer stays
     with ExitStack() as stack:
         with Display(console, plain=plain, judged=config.scene.goal_view_is_known,
@@ -74,14 +78,15 @@ def run(config: Config, *, agent: str, out: Path | None, plain: bool, console: C
                         launched(config, folder, display.take, processes, display.say, display.topics))
                     results = ended.results
                 else:
-                    results = run_here(config, agent, folder, display, world)
+                    results = run_here(config, agent, folder, display, world, lacks)
             except KeyboardInterrupt:
                 if not place.live or display.progress.at is None:
                     raise
                 results = []
         for text in summary(config, results, display.progress):
             say(console, text)
-        finished = Finished(config, folder, results, lambda: ended is not None and ended.runs(VIEWER.name))
+        finished = Finished(config, folder, results, lambda: ended is not None and ended.runs(VIEWER.name),
+                            tuple(lacks))
         if after is not None:
             after(finished)
     return finished
@@ -134,11 +139,13 @@ def require_weights(agent: str, config: Config) -> None:
         Weights(config.weights)
 
 
-def run_here(config: Config, agent: str, folder: Path, display: Display, world: str = DEFAULT_WORLD) -> list[Result]:
-    """Runs within this process, and logs as on the bus. If the log cannot take any more, the run goes on without it."""
+def run_here(config: Config, agent: str, folder: Path, display: Display, world: str, lacks: list[str]) -> list[Result]:
+    """Runs within this process, and logs as on the bus. If the log cannot take any more, the run goes on without it,
+    and `lacks` says why."""
     pairs = local_pairs(agent, config, world)
     source = pairs[0][1]
-    folder.mkdir(parents=True, exist_ok=True)
+    with writing(folder, "run"):
+        folder.mkdir(parents=True, exist_ok=True)
     config.save(folder / CONFIG_NAME)
     log = RunLog(folder / LOG_NAME, world=config.bus.world, configuration=config.model_dump_json(indent=2),
                  metadata=describe(config, folder.name) | to_be_finished())
@@ -146,33 +153,41 @@ def run_here(config: Config, agent: str, folder: Path, display: Display, world: 
     def on_message(topic: Topic, part: str | None, message: Message, payload: bytes | None) -> None:
         end_if_interrupted()
         assert payload is not None  # because of encoded=True
-        try:
+        with _told(lacks):  # once; later messages are not logged
             log.write(topic, part, payload, sequence=message.seq)
-        except RecordingStopped as error:  # raised once; later messages are not logged
-            print(f"saccade: {error}", file=sys.stderr)
         display.take(topic, part, message)
 
     display.note("\n".join(getattr(source, "notes", ())))
     with _interrupted_between_messages() as end_if_interrupted:
         try:
             run_local(pairs, config.names, folder.name, on_message=on_message, encoded=True)
-            _finish(log, source)
+            _finish(log, source, lacks)
         except KeyboardInterrupt:
             if world_of(world).live:  # one of the ends that the run of a real camera has
-                _finish(log, source)
+                _finish(log, source, lacks)
             raise
         finally:
-            log.close()
+            with _told(lacks):
+                log.close()
             if left_out := getattr(source, "skipped", 0):
                 display.note(f"{left_out} images without a pose were left out")
     return display.progress.results
 
 
-def _finish(log: RunLog, source: object) -> None:
+def _finish(log: RunLog, source: object, lacks: list[str]) -> None:
     """Notes in the log that the run has come to its end."""
-    try:
+    with _told(lacks):
         log.note(FINISHED, {"episodes": getattr(source, "episodes", 1)})
+
+
+@contextmanager
+def _told(lacks: list[str]) -> Iterator[None]:
+    """Around what writes a log. A log that cannot take any more is no end of the run: it is said, and added to
+    `lacks`."""
+    try:
+        yield
     except RecordingStopped as error:
+        lacks.append(str(error))
         print(f"saccade: {error}", file=sys.stderr)
 
 
@@ -201,6 +216,8 @@ def _interrupted_between_messages() -> Iterator[Callable[[], None]]:
 
 
 def _new_folder(folder: Path) -> Path:
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+    if not is_text(str(folder.absolute())):
+        raise SaccadeError(f"run folder {folder} must be Unicode without control codes: give another --out")
+    if os.path.lexists(folder) and (not os.path.isdir(folder) or any(folder.iterdir())):
         raise SaccadeError(f"{folder} is there already: a run needs a new folder, give another --out")
     return folder
