@@ -29,6 +29,7 @@ from saccade.app.run.registry import DEFAULT_WORLD, WORLDS, agent_processes, wor
 from saccade.app.run.summary import summary
 from saccade.app.run.supervisor import HUNG_S, Process
 from saccade.deploy.container import LATEST, OVER, ROUTER_S, heartbeat_file, runs_folder
+from saccade.services.viewer.admission import with_token
 from saccade.services.viewer.server import url_of
 from saccade.shared.bus.messages import Message, Result
 from saccade.shared.bus.topics import BELIEF, FRAME, PLAN, RESULT, STATUS, TRUTH, Topic
@@ -59,6 +60,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--intrinsics", metavar="fx,fy,cx,cy", help="intrinsics of its images, in pixels")
     parser.add_argument("--view-port", type=int, help="port of the viewer's page, open to other hosts")
     parser.add_argument("--view-data-port", type=int, default=9876, help="port of the viewer's data")
+    parser.add_argument("--view-published", metavar="ADDRESS",
+                        help="address of the machine on which a container publishes these ports")
     parser.add_argument("--set", default="", metavar="'KEY=VALUE ...'", help="configuration by dotted keys")
     told = parser.parse_args(argv)
     signal.signal(signal.SIGTERM, lambda *_: os._exit(0))  # its threads wait for messages, and nothing is left to save
@@ -71,8 +74,9 @@ def main(argv: Sequence[str] | None = None) -> None:
             given |= {"scene.count": None, "scene.explore": True, "bus.live": True}
         if told.view_port:
             given |= {"viewer.address": "0.0.0.0", "viewer.port": told.view_port,
-                      "viewer.data_port": told.view_data_port}
+                      "viewer.data_port": told.view_data_port, "viewer.published": told.view_published}
         config = configured(None, given, shlex.split(told.set))
+        config = config.with_values({"viewer.token": with_token(config.viewer).token})
         direct(config, told.world, told.worlds, runs_folder(), Console(width=200))
     except SaccadeError as error:
         print(f"saccade: {error}", file=sys.stderr)

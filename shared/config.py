@@ -198,11 +198,15 @@ class ViewerConfig(Section):
     """The viewer in a browser."""
 
     address: str = "127.0.0.1"
-    """Address on which the viewer listens."""
+    """Address on which the viewer listens. If other hosts can reach it, a browser needs the token."""
+    published: str | None = None
+    """Address on which a container's ports are published. With a loopback address a browser needs no token."""
+    token: str | None = Field(None, pattern=r"^[A-Za-z0-9_-]{16,128}$")
+    """Token that a browser must give. The launcher draws a new one for every run and prints it in the address."""
     port: int = Field(9090, ge=1, le=65535)
     """Port of the page."""
     data_port: int = Field(0, ge=0, le=65535)
-    """Port of the page's data. With 0, a free port is picked."""
+    """Port for Rerun viewers that are not a browser. With 0, a free port is picked."""
     memory_mb: int = Field(1024, ge=16, le=1_000_000)
     """Memory for the past of a run: a browser that comes late sees as much of it."""
     truth: bool = False

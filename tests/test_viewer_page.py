@@ -16,17 +16,22 @@ from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 import pytest
+import rerun as rr
 from PIL import Image
 from playwright.sync_api import sync_playwright
 
-from saccade.services.viewer.server import binary, free_port, listens
+from saccade.services.viewer.live import connected
+from saccade.services.viewer.server import Server, binary, free_port, listens
 from saccade.shared.config import PACKAGE
 from saccade.tests.fixtures.make import GOLDEN
 from saccade.tests.test_viewer import Seen
+from saccade.tests.test_viewer_door import READ
+from saccade.tests.test_viewer_server import configured
 
 ARTEFACTS = PACKAGE / "artefacts"
 WAIT_S = 300
-FLAGS = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+FLAGS = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader",
+         "--host-resolver-rules=MAP *.example 127.0.0.1")  # as the owner of such a name could have it
 SIZE = {"width": 1400, "height": 860}
 # left, top, right and bottom of what the layout puts there, as shares of the page
 PLACES = {"world": (0.02, 0.10, 0.48, 0.75), "camera": (0.51, 0.09, 0.66, 0.32), "goal": (0.68, 0.09, 0.82, 0.32),
@@ -69,7 +74,7 @@ def until(done) -> bool:
 
 
 def data_port_of(port: int) -> int:
-    """Where the page at this port has its data from."""
+    """The port from which the page at this port gets its data."""
     door = HTTPConnection("127.0.0.1", port, timeout=WAIT_S)
     door.request("GET", "/")
     data, = parse_qs(urlsplit(door.getresponse().headers["Location"]).query)["url"]
@@ -167,6 +172,32 @@ def test_a_running_episode_is_seen_and_moves(browser, tmp_path):
             later = recorded(data_port_of(another), tmp_path / "later.rrd")
         assert run.poll() is None  # that was while it ran
     assert (late, later) == ([], [])
+
+
+def test_a_browser_gets_in_with_the_token_alone(browser):
+    """The whole address shows the page and gets the data. Without the token, under a name that points to this machine,
+    and from a page of another site nothing is answered but 403."""
+    answered: list[tuple[str, int]] = []
+    with Server(configured(address="0.0.0.0")) as server, browser.new_context() as context:
+        recording = rr.RecordingStream("saccade")
+        with connected(recording, server):
+            recording.log("said", rr.TextLog("hello"))
+            page = context.new_page()
+            page.on("response", lambda response: answered.append((response.url, response.status)))
+
+            def data(address: str) -> list[int]:
+                return [status for url, status in answered if url == f"{address}{READ}"]
+
+            assert page.goto(server.page).status == 403
+            assert page.goto(server.url).status == 200
+            assert "token" not in page.url
+            assert until(lambda: page.wait_for_timeout(100) or data(server.page)) == [200]
+            strange = server.page.replace("localhost", "rebound.example")
+            assert page.goto(strange).status == 403
+            for address in (server.page, f"http://localhost:{server.data_port}"):
+                page.evaluate(f"fetch('{address}{READ}', {{method: 'POST', mode: 'no-cors', credentials: 'include', "
+                              "body: '\\0\\0\\0\\0\\0'}).catch(String)")
+                assert until(lambda at=address: page.wait_for_timeout(100) or data(at)[-1:]) == [403]
 
 
 def test_a_log_is_seen(browser):

@@ -5,11 +5,14 @@ from __future__ import annotations
 import http.client
 import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import time
+from ipaddress import ip_address
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -18,7 +21,6 @@ import psutil
 import pytest
 import rerun as rr
 
-from saccade.services.viewer.door import host_of
 from saccade.services.viewer.live import connected
 from saccade.services.viewer.server import Server, free_port, listens, url_of, with_free_ports
 from saccade.shared.config import Config
@@ -26,6 +28,8 @@ from saccade.shared.errors import SaccadeError
 
 WAIT_S = 30
 MEBI = 2 ** 20
+SHOWN = ("from saccade.tests.test_viewer_server import Server, configured, time\n"
+         "with Server(configured()) as s: print(s.data_url, s._home.path, flush=True); time.sleep(600)")
 
 
 def configured(**values):
@@ -40,30 +44,39 @@ def server():
 
 
 def answer(server: Server, path: str, **headers: str) -> http.client.HTTPResponse:
-    connection = http.client.HTTPConnection(server.url.removeprefix("http://"), timeout=WAIT_S)
+    return answer_at(urlsplit(server.url).port, path, **headers)
+
+
+def answer_at(port: int, path: str, **headers: str) -> http.client.HTTPResponse:
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=WAIT_S)
     connection.request("GET", path, headers=headers)
     return connection.getresponse()
 
 
 def test_the_bare_address_shows_the_recording_and_the_page_speaks_to_nobody_else(server):
+    port = urlsplit(server.url).port
     sent = answer(server, "/")
     assert sent.status == 302
-    assert f"rerun%2Bhttp%3A%2F%2F127.0.0.1%3A{server.data_port}%2Fproxy" in sent.headers["Location"]
-    assert f"studio.local%3A{server.data_port}" in answer(server, "/", Host="studio.local:9090").headers["Location"]
+    assert f"rerun%2Bhttp%3A%2F%2F127.0.0.1%3A{port}%2Fproxy" in sent.headers["Location"]
+    assert sent.headers["Set-Cookie"] is None
+    assert f"localhost%3A{port}" in answer(server, "/", Host=f"localhost:{port}").headers["Location"]
+    assert "localhost%3A80%2F" in answer(server, "/", Host="localhost").headers["Location"]
     page = answer(server, sent.headers["Location"])
     assert page.status == 200
     assert b"re_viewer.js" in page.read()
     allowed = page.headers["Content-Security-Policy"].split("connect-src")[1].split()
-    assert allowed == ["'self'", f"http://127.0.0.1:{server.data_port}", "blob:", "data:"]
+    assert allowed == ["'self'", "blob:", "data:"]
+    assert page.headers["Access-Control-Allow-Origin"] is None
     assert answer(server, "/re_viewer.js").headers["Content-Type"].startswith("text/javascript")
+    assert len(answer(server, "/re_viewer_bg.wasm").read()) > 10 * MEBI
     assert answer(server, "/nothing").status == 404
 
 
-@pytest.mark.parametrize(("header", "host"), [
-    ("localhost:9090", "localhost"), ("[::1]:9090", "[::1]"), ("", "here"), ("a b", "here"), ("x;script-src *", "here"),
-    ("[", "here"), ("evil.example\r\nX: y", "evil.examplex")])
-def test_a_host_is_a_name_and_nothing_else(header, host):
-    assert host_of(header, "here") == host
+def until(done) -> bool:
+    end_s = time.monotonic() + WAIT_S
+    while not (well := done()) and time.monotonic() < end_s:
+        time.sleep(0.1)
+    return well
 
 
 def test_it_listens_on_the_loopback_alone_and_tells_nobody_that_it_is_used(server):
@@ -71,22 +84,11 @@ def test_it_listens_on_the_loopback_alone_and_tells_nobody_that_it_is_used(serve
     children = [p for p in mine.children(recursive=True) if "--serve-web" in p.cmdline()]
     listening = {c.laddr.ip for p in (mine, *children) for c in p.net_connections() if c.status == psutil.CONN_LISTEN}
     assert len(children) == 1
-    assert listening == {"127.0.0.1"}
+    assert all(ip_address(address).is_loopback for address in listening)
+    if sys.platform == "linux":  # Rerun's own ports are where a page of another site does not find them
+        assert "127.0.0.1" not in {c.laddr.ip for c in children[0].net_connections() if c.status == psutil.CONN_LISTEN}
     home = Path(children[0].environ()["HOME"])
     assert json.loads((home / ".config" / "rerun" / "analytics.json").read_text())["analytics_enabled"] is False
-
-
-def test_opened_to_other_hosts_its_page_may_come_from_any_of_its_names():
-    with Server(configured(address="0.0.0.0")) as server:
-        assert server.url.startswith("http://localhost:")
-        asked = {"Access-Control-Request-Method": "POST", "Access-Control-Request-Headers": "x-grpc-web"}
-        connection = http.client.HTTPConnection("127.0.0.1", server.data_port, timeout=WAIT_S)
-        ours = f"http://studio.local:{urlsplit(server.url).port}"
-        for origin, allowed in ((ours, ours), ("http://elsewhere.example", None)):
-            connection.request("OPTIONS", "/", headers=asked | {"Origin": origin})
-            answer = connection.getresponse()
-            answer.read()
-            assert answer.headers["Access-Control-Allow-Origin"] == allowed
 
 
 def test_what_it_keeps_is_bounded():
@@ -111,7 +113,7 @@ def test_a_port_that_is_taken_is_said_in_one_line():
         with pytest.raises(SaccadeError, match=f"viewer: port {port} of 127.0.0.1 cannot be opened"):
             Server(config.viewer)
         assert with_free_ports(config).viewer.port == free_port("127.0.0.1", port) > port
-        with pytest.raises(SaccadeError, match=f"Rerun's server does not start on port {port}"):
+        with pytest.raises(SaccadeError, match=rf"port {port} of 127.0.0.1 cannot be opened .* viewer.data_port"):
             Server(configured(data_port=port))
     assert configured(port=port, data_port=port).port > port  # the page and its data have two
     assert url_of(configured(address="0.0.0.0")).startswith("http://localhost:")
@@ -137,14 +139,50 @@ def test_who_looks_on_comes_last_and_its_terminal_does_not(own_session):
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere a killed process leaves its children")
 def test_a_viewer_that_is_killed_takes_its_server_along():
-    code = ("from saccade.tests.test_viewer_server import Server, configured, time\n"
-            "with Server(configured()) as s: print(s.data_port, flush=True); time.sleep(600)")
-    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as viewer:
-        port = int(viewer.stdout.readline())
-        socket.create_connection(("127.0.0.1", port), timeout=WAIT_S).close()
+    with subprocess.Popen([sys.executable, "-c", SHOWN], stdout=subprocess.PIPE, text=True) as viewer:
+        data, _ = viewer.stdout.readline().split()
+        rerun = urlsplit(data.removeprefix("rerun+"))
+        socket.create_connection((rerun.hostname, rerun.port), timeout=WAIT_S).close()
         os.kill(viewer.pid, signal.SIGKILL)
         viewer.wait()
-    end_s = time.monotonic() + WAIT_S
-    while listens("127.0.0.1", port) and time.monotonic() < end_s:
-        time.sleep(0.1)
-    assert not listens("127.0.0.1", port)
+    assert until(lambda: not listens(rerun.hostname, rerun.port))
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no locks on folders")
+def test_the_folder_of_a_killed_viewer_is_removed_by_the_next_and_no_other(tmp_path, monkeypatch):
+    """What is in use, what is another user's, and what is no folder stays."""
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    viewers = [subprocess.Popen([sys.executable, "-c", SHOWN], stdout=subprocess.PIPE, text=True) for _ in range(2)]
+    try:
+        killed, used = (Path(viewer.stdout.readline().split()[1]) for viewer in viewers)
+        assert {killed.parent, used.parent} == {tmp_path}
+        viewers[0].kill()
+        viewers[0].wait()
+        (tmp_path / "other").mkdir()
+        (tmp_path / "saccade-viewer-file").touch()
+        (tmp_path / "saccade-viewer-link").symlink_to(tmp_path / "other")
+        kept = {"other", "saccade-viewer-file", "saccade-viewer-link", used.name}
+        if os.getuid() == 0:
+            (tmp_path / "saccade-viewer-theirs").mkdir()
+            os.chown(tmp_path / "saccade-viewer-theirs", 1234, 1234)
+            kept.add("saccade-viewer-theirs")
+        assert killed.is_dir()
+        with Server(configured()) as server:
+            assert {path.name for path in tmp_path.iterdir()} == kept | {server._home.path.name}
+            assert (used / "log").is_file()
+        assert {path.name for path in tmp_path.iterdir()} == kept
+    finally:
+        for viewer in viewers:
+            viewer.kill()
+            viewer.communicate()
+
+
+def test_a_server_that_does_not_start_leaves_no_folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    monkeypatch.setattr("saccade.services.viewer.server.binary", lambda: shutil.which("false"))
+    monkeypatch.setattr("saccade.services.viewer.server.Server._environment", lambda _: dict(os.environ))
+    with pytest.raises(SaccadeError, match=r"Rerun's server does not start at 127\..*: it said 'nothing'"):
+        Server(configured())
+    assert list(tmp_path.iterdir()) == []

@@ -1,88 +1,195 @@
-"""A small web server in front of Rerun's page.
+"""The door of the viewer: the two ports that others reach, in front of the two ports of Rerun's server.
 
-The plain address of the viewer shows the recording. A content security policy lets the page connect to its own server
-only.
+It reads the head of every request and refuses what may not pass (`admission.py`). Then it only forwards bytes. A page
+gets its data from the port that it came from, so a browser sends it the page's own cookie. The second port is for Rerun
+viewers that are not a browser.
 """
 
 from __future__ import annotations
 
-import http.client
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from urllib.parse import quote, urlsplit
+import asyncio
+import contextlib
+import socket
+import threading
+from collections.abc import Awaitable, Callable
+from urllib.parse import quote
 
+from saccade.services.viewer.admission import Head, Rules, head_of
 from saccade.shared.config import ViewerConfig
 from saccade.shared.errors import SaccadeError
 
-ANSWER_S = 20.0  # how long to wait for Rerun's server
-KEPT = ("Content-Type", "Content-Encoding", "rerun-final-length")  # headers that are passed on with the page's files
+Address = tuple[str, int]
+Guest = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
+
+MOST = 64  # connections at the same time; more are refused
+BYTES = 64 * 1024  # the longest head, and what a direction of a connection holds in memory, about
+HEAD_S = 10.0  # how long to wait for a head
+ANSWER_S = 20.0  # how long to wait for Rerun's server to be connected
+END = b"\r\n\r\n"
+HTTP2 = b"PRI * HTTP/2.0\r\n\r\n"  # how a connection of HTTP/2 without TLS begins
+REPLACED = ("connection", "content-security-policy", "access-control-")  # headers of the page that are ours to set
+REASONS = {302: "Found", 400: "Bad Request", 403: "Forbidden", 405: "Method Not Allowed", 411: "Length Required",
+           502: "Bad Gateway", 503: "Service Unavailable"}
 
 
-def open_door(config: ViewerConfig, host: str, pages: int, data_port: int) -> ThreadingHTTPServer:
-    """Opens a web server at the viewer's address.
+class Door:
+    """Listens at the viewer's two ports, and forwards to Rerun's `pages` and `data`, from `open` until `close`.
 
-    `/` redirects a browser to the recording, whose data comes from `data_port`. Every other path is passed on to the
-    server at host:pages. Raises SaccadeError if the port cannot be opened.
+    Raises SaccadeError if a port cannot be opened.
     """
-    try:
-        door = ThreadingHTTPServer((config.address, config.port), _handler(host, pages, data_port))
-    except OSError as error:
-        raise SaccadeError(f"viewer: port {config.port} of {config.address} cannot be opened ({error.strerror}): "
-                           "choose another with viewer.port") from error
-    door.daemon_threads = True
-    return door
 
+    def __init__(self, config: ViewerConfig, data_port: int, pages: Address, data: Address) -> None:
+        self._rules = Rules(config.port, config.token)
+        self._pages, self._data = pages, data
+        self._sockets: list[socket.socket] = []
+        try:
+            self._sockets.append(_listen(config.address, config.port, "viewer.port"))
+            self._sockets.append(_listen(config.address, data_port, "viewer.data_port"))
+        except SaccadeError:
+            self.close()
+            raise
+        self._met = 0
+        self._loop = asyncio.new_event_loop()
+        self._stop = asyncio.Event()
+        self._thread = threading.Thread(target=self._run, name="door", daemon=True)
 
-def _handler(page_host: str, pages: int, data_port: int) -> type[BaseHTTPRequestHandler]:
-    class Door(BaseHTTPRequestHandler):
-        protocol_version = "HTTP/1.1"
+    def open(self) -> None:
+        """Lets others in from now on."""
+        self._thread.start()
 
-        def do_HEAD(self) -> None:
-            self.do_GET()
+    def close(self) -> None:
+        """Ends every connection. May be called twice, and before `open`."""
+        if len(self._sockets) == 2 and self._thread.is_alive():
+            with contextlib.suppress(RuntimeError):  # it has ended already
+                self._loop.call_soon_threadsafe(self._stop.set)
+            self._thread.join(HEAD_S)
+        for listening in self._sockets:
+            listening.close()
 
-        def do_GET(self) -> None:
-            host = host_of(self.headers.get("Host", ""), page_host)
-            if self.path == "/":
-                data = quote(f"rerun+http://{host}:{data_port}/proxy", safe="")
-                self._answer(302, b"", {"Location": f"/?url={data}&theme=dark&hide_welcome_screen"})
-                return
-            connection = http.client.HTTPConnection(page_host, pages, timeout=ANSWER_S)
+    def _run(self) -> None:
+        with asyncio.Runner(loop_factory=lambda: self._loop) as runner:
+            runner.run(self._serve())
+
+    async def _serve(self) -> None:
+        page, data = self._sockets
+        await asyncio.start_server(self._guest(has_page=True), sock=page, limit=BYTES)
+        await asyncio.start_server(self._guest(has_page=False), sock=data, limit=BYTES)
+        await self._stop.wait()
+
+    def _guest(self, *, has_page: bool) -> Guest:
+        async def meet(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            self._met += 1
+            with contextlib.suppress(OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError, TimeoutError):
+                if self._met > MOST:
+                    await _answer(writer, 503, "too many connections: close other pages of this viewer")
+                else:
+                    await self._meet(reader, writer, has_page=has_page)
+            self._met -= 1
+            writer.close()
+
+        return meet
+
+    async def _meet(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, *, has_page: bool) -> None:
+        data = await asyncio.wait_for(reader.readuntil(END), HEAD_S)
+        if data == HTTP2:
+            if self._rules.admits_native(str(writer.get_extra_info("peername")[0])):
+                await self._forward(self._data, data, reader, writer)
+            else:
+                await _answer(writer, 403, "only a browser gets in from another host: for a Rerun viewer use ssh -L")
+            return
+        head = head_of(data)
+        if head is None:
+            await _answer(writer, 400, "this is no request of a browser")
+        elif refusal := self._rules.refusal(head):
+            await _answer(writer, 403, refusal)
+        elif "transfer-encoding" in head.headers or not head.headers.get("content-length", "0").isdecimal():
+            await _answer(writer, 411, "a request needs a length")
+        elif has_page and head.method in ("GET", "HEAD"):
+            await self._show(head, reader, writer)
+        elif has_page and head.method != "POST":
+            await _answer(writer, 405, "the viewer only shows")
+        else:
+            await self._forward(self._data, _alone(head), reader, writer, int(head.headers.get("content-length", 0)))
+
+    async def _show(self, head: Head, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """A file of the page; the bare address leads to the recording, and takes the token out of sight."""
+        if head.target.partition("?")[0] != "/" or ("url" in head.query and "token" not in head.query):
+            await self._forward(self._pages, _alone(head), reader, writer, 0, page=True)
+            return
+        data = quote(f"rerun+http://{head.host_and_port}/proxy", safe="")
+        kept = f"Set-Cookie: {self._rules.cookie}={self._rules.token}; Path=/; HttpOnly; SameSite=Lax\r\n"
+        await _answer(writer, 302, "", f"Location: /?url={data}&theme=dark&hide_welcome_screen\r\n" +
+                      (kept if self._rules.token else ""))
+
+    async def _forward(self, to: Address, head: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter,
+                       length: int | None = None, *, page: bool = False) -> None:
+        """One request with a body of `length` bytes, or everything without it. Ends when one of the two sides does."""
+        try:
+            inner, out = await asyncio.wait_for(asyncio.open_connection(*to, limit=BYTES), ANSWER_S)
+        except (OSError, TimeoutError):
+            await _answer(writer, 502, "Rerun's server does not answer: start the viewer again")
+            return
+        try:
+            out.write(head)
+            ways = [asyncio.ensure_future(_pump(reader, out, length)),
+                    asyncio.ensure_future(_pump_answer(inner, writer) if page else _pump(inner, writer))]
             try:
-                connection.request("GET", self.path)
-                answer = connection.getresponse()
-                kept = {name: answer.headers[name] for name in KEPT if name in answer.headers}
-                self._answer(answer.status, answer.read(), kept | {"Content-Security-Policy": policy(host, data_port)})
-            except (OSError, http.client.HTTPException):
-                self.send_error(502, "the viewer's server does not answer")
+                await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
             finally:
-                connection.close()
-
-        def _answer(self, status: int, body: bytes, headers: dict[str, str]) -> None:
-            self.send_response(status)
-            for name, value in (headers | {"Content-Length": str(len(body))}).items():
-                self.send_header(name, value)
-            self.end_headers()
-            if self.command != "HEAD":
-                self.wfile.write(body)
-
-        def log_message(self, *_: object) -> None:
-            """Logs nothing: a line for every file of a page would be of no use."""
-
-    return Door
+                for way in ways:
+                    way.cancel()
+                await asyncio.gather(*ways, return_exceptions=True)
+        finally:
+            out.close()
 
 
-def host_of(header: str, otherwise: str) -> str:
-    """The name by which the browser knows this machine, from its Host header. `otherwise` if that is not a name."""
+async def _pump(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, length: int | None = None) -> None:
+    """Forwards bytes until the reader's end. What comes after `length` bytes is dropped: only the first request of a
+    connection was looked at."""
+    left = length
+    while data := await reader.read(BYTES):
+        if left is not None:
+            data = data[:left]
+            left -= len(data)
+        if data:
+            writer.write(data)
+            await writer.drain()
+
+
+async def _pump_answer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    """An answer of the page's server, with our own headers."""
+    first, *lines = (await reader.readuntil(END)).removesuffix(END).split(b"\r\n")
+    kept = [line for line in lines if not line.lower().startswith(tuple(name.encode() for name in REPLACED))]
+    ours = [b"Connection: close", f"Content-Security-Policy: {policy()}".encode()]
+    writer.write(b"\r\n".join([first, *kept, *ours]) + END)
+    await _pump(reader, writer)
+
+
+async def _answer(writer: asyncio.StreamWriter, status: int, text: str, headers: str = "") -> None:
+    body = f"{status} {text}\n".encode() if text else b""
+    writer.write(f"HTTP/1.1 {status} {REASONS[status]}\r\n{headers}Content-Type: text/plain; charset=utf-8\r\n"
+                 f"Content-Length: {len(body)}\r\nConnection: close\r\n\r\n".encode() + body)
+    await writer.drain()
+
+
+def _alone(head: Head) -> bytes:
+    """The head of a request that is the only one of its connection, without the cookies."""
+    kept = (f"{name}: {value}" for name, value in head.headers.items()
+            if name not in ("connection", "keep-alive", "upgrade", "cookie", "authorization"))
+    return "\r\n".join([f"{head.method} {head.target} HTTP/1.1", *kept, "connection: close"]).encode("latin-1") + END
+
+
+def _listen(address: str, port: int, key: str) -> socket.socket:
+    family = socket.AF_INET6 if ":" in address else socket.AF_INET
     try:
-        host = urlsplit(f"//{header}").hostname or ""
-    except ValueError:
-        host = ""
-    if not host or not all(letter.isalnum() or letter in "-.:" for letter in host):
-        host = otherwise
-    return f"[{host}]" if ":" in host else host
+        return socket.create_server((address, port), family=family,
+                                    dualstack_ipv6=address == "::" and socket.has_dualstack_ipv6())
+    except OSError as error:
+        raise SaccadeError(f"viewer: port {port} of {address} cannot be opened ({error.strerror}): "
+                           f"choose another with {key}") from error
 
 
-def policy(host: str, data_port: int) -> str:
-    """The page's content security policy: the page may connect only to this server and to the recording's data."""
+def policy() -> str:
+    """The page's content security policy: the page may connect only to the server that it came from."""
     return ("default-src 'self' 'unsafe-inline' blob: data:; "
-            "script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval' blob:; "
-            f"connect-src 'self' http://{host}:{data_port} blob: data:")
+            "script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval' blob:; connect-src 'self' blob: data:")

@@ -58,7 +58,7 @@ def watch(bus: Bus, server: Server, config: Config, inbox: Inbox, health: Health
                                    batcher_config=batches)
     with connected(recording, server):
         feed = _Feed(Viewer(recording, config, truth=config.viewer.truth, live=True), health)
-        health.say(state="ready", note=server.url)
+        health.say(state="ready", note=server.page)
         for kept in sorted(past, key=lambda kept: kept.published_ns):
             feed.take(kept.topic, kept.part, kept.payload)
         past.clear()  # frees the memory, which may be hundreds of megabytes

@@ -1,26 +1,27 @@
 """Rerun's server with its web viewer. It keeps the recording for browsers that connect later, up to a memory limit.
 
-It has two ports: one for the page, which passes through our own small web server (`door.py`), and one for the data.
-Rerun's usage analytics are switched off.
+It has two ports: one for the page, and one for the data. Both are behind a door of ours (`door.py`), which decides who
+may pass. Rerun's usage analytics are switched off.
 """
 
 from __future__ import annotations
 
 import ctypes
 import os
+import secrets
 import signal
 import socket
 import subprocess
 import sys
-import tempfile
-import threading
 import time
 from collections.abc import Callable, Collection
 from importlib.util import find_spec
 from pathlib import Path
 from types import TracebackType
 
-from saccade.services.viewer.door import open_door
+from saccade.services.viewer.admission import with_token
+from saccade.services.viewer.door import Door
+from saccade.services.viewer.home import Home
 from saccade.services.viewer.priority import session_comes_last
 from saccade.shared.config import Config, ViewerConfig
 from saccade.shared.errors import SaccadeError
@@ -32,24 +33,32 @@ PR_SET_PDEATHSIG = 1  # Linux: the signal that a process gets when its parent di
 
 
 class Server:
-    """Rerun's server as a child process, and the web server in front of its page, at `url`.
+    """Rerun's server as a child process, and the door in front of it, at `url`. `page` is the address without a token.
 
     Raises SaccadeError if it cannot be started, for example because Rerun is not installed or a port is in use.
     """
 
     def __init__(self, config: ViewerConfig) -> None:
-        self._home = tempfile.TemporaryDirectory(prefix="saccade-viewer-", ignore_cleanup_errors=True)
+        config = config if config.token else with_token(config)
         self.data_port = config.data_port or free_port(config.address, but=(config.port,))
-        self.address, self.url = config.address, url_of(config)
-        pages = free_port(config.address, but=(config.port, self.data_port))
-        self._door = open_door(config, here(config.address), pages, self.data_port)
-        self._child = self._start(config, pages)
-        threading.Thread(target=self._door.serve_forever, name="door", daemon=True).start()
+        self.url, self.page = url_of(config), url_of(config, token=False)
+        self._address = own_address()
+        self._data = free_port(self._address)
+        pages = free_port(self._address, but=(self._data,))
+        self._door = Door(config, self.data_port, (self._address, pages), (self._address, self._data))
+        self._home = Home()
+        try:
+            self._child = self._start(config, pages)
+        except BaseException:
+            self._door.close()
+            self._home.close()
+            raise
+        self._door.open()
 
     @property
     def data_url(self) -> str:
-        """The address to which a recording is sent."""
-        return f"rerun+http://{here(self.address)}:{self.data_port}/proxy"
+        """The address to which this process sends a recording. It is Rerun's own, which nobody else is told."""
+        return f"rerun+http://{self._address}:{self._data}/proxy"
 
     @property
     def running(self) -> bool:
@@ -61,57 +70,67 @@ class Server:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
                  trace: TracebackType | None) -> None:
-        self._door.shutdown()
-        self._door.server_close()
+        self._door.close()
         self._child.terminate()
         try:
             self._child.wait(STOP_S)
         except subprocess.TimeoutExpired:
             self._child.kill()
             self._child.wait()
-        self._home.cleanup()
+        self._home.close()
 
     def _start(self, config: ViewerConfig, pages: int) -> subprocess.Popen:
-        log = Path(self._home.name) / "log"
-        command = [binary(), "--serve-web", "--bind", self.address, "--port", str(self.data_port), "--web-viewer-port",
+        log = self._home.path / "log"
+        command = [binary(), "--serve-web", "--bind", self._address, "--port", str(self._data), "--web-viewer-port",
                    str(pages), "--server-memory-limit", f"{config.memory_mb}MB"]
-        if self.address != LOOPBACK:
-            command += ["--cors-allow-origin", f"http://*:{config.port}"]
         with log.open("wb") as out:
             child = subprocess.Popen(command, env=self._environment(), stdin=subprocess.DEVNULL, stdout=out,
                                      stderr=subprocess.STDOUT, start_new_session=True, preexec_fn=_as_child())
         end_s = time.monotonic() + START_S
-        while not (listens(self.address, self.data_port) and listens(self.address, pages)):
+        while not (listens(self._address, self._data) and listens(self._address, pages)):
             if child.poll() is not None or time.monotonic() > end_s:
                 child.kill()
-                self._door.server_close()
+                child.wait()
                 said = [line for line in log.read_text(errors="replace").splitlines() if line.strip()] or ["nothing"]
-                raise SaccadeError(f"viewer: Rerun's server does not start on port {self.data_port}: it said "
-                                   f"{said[-1][-300:]!r}")
+                raise SaccadeError(f"viewer: Rerun's server does not start at {self._address}: it said "
+                                   f"{said[-1][-300:]!r}; start the viewer again")
             time.sleep(0.05)
         return child
 
     def _environment(self) -> dict[str, str]:
         """The environment of the child process, with a home folder of its own in which analytics are off."""
         kept = {name: value for name, value in os.environ.items() if not name.startswith("XDG_")}
-        environment = {**kept, "HOME": self._home.name, "RUST_LOG": "warn", "NO_COLOR": "1"}
+        environment = {**kept, "HOME": str(self._home.path), "RUST_LOG": "warn", "NO_COLOR": "1"}
         subprocess.run([binary(), "analytics", "disable"], env=environment, capture_output=True, check=True)
         return environment
 
 
-def url_of(config: ViewerConfig) -> str:
-    """The address that a user types into a browser."""
-    return f"http://{'localhost' if config.address in ('0.0.0.0', '::') else config.address}:{config.port}"
+def url_of(config: ViewerConfig, *, token: bool = True) -> str:
+    """The address that a user opens in a browser."""
+    name = "localhost" if config.address in ("0.0.0.0", "::") else config.address
+    page = f"http://{f'[{name}]' if ':' in name else name}:{config.port}"
+    return f"{page}/?token={config.token}" if config.token and token else page
+
+
+def own_address() -> str:
+    """A loopback address for Rerun's server, which checks no Host and no Origin.
+
+    Linux has 16 million of them. This is one at random, so that a page of another site would have to guess it.
+    """
+    if sys.platform != "linux":
+        return LOOPBACK
+    return f"127.{secrets.randbelow(256)}.{secrets.randbelow(256)}.{1 + secrets.randbelow(254)}"
 
 
 def with_free_ports(config: Config) -> Config:
-    """The configuration with free ports for a viewer: the configured ones, or the next that are free.
+    """The configuration with free ports for a viewer: the configured ones, or the next that are free. If other hosts
+    reach the viewer, it gets a new token.
 
     Raises SaccadeError if no port is free.
     """
     viewer = config.viewer
     port = free_port(viewer.address, viewer.port, but=(viewer.data_port,))
-    return config.with_values({"viewer.port": port,
+    return config.with_values({"viewer.port": port, "viewer.token": with_token(viewer).token,
                                "viewer.data_port": viewer.data_port or free_port(viewer.address, but=(port,))})
 
 
