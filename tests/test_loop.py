@@ -194,6 +194,7 @@ def test_a_stray_message_of_another_run_or_step_does_not_stop_the_loop():
         running.until_status("planner", lambda s: s.state == "ready")
         for topic, part in ((PERCEPT, "mug"), (GOAL_PERCEPT, "can"), (BELIEF, "mug")):
             running.listener.publish(topic, part, encode(sample(topic.type, run="other", step=9, object=part)))
+        running.until_status("planner", lambda s: s.refused == 1 and "belief/mug: run: 'other', not this" in s.note)
         running.listener.publish(ACTION, None, encode(sample(ACTION.type, run="r", episode=0, step=4)))
         running.listener.publish(STATUS, "nobody", encode(sample(Status, service="nobody", state="ready")))
         seen = running.until(lambda t, p, b: t == RESULT and decode(t.type, b).episode == CONFIG.scene.count - 1)
@@ -215,9 +216,9 @@ def test_a_service_says_what_it_waits_for_and_goes_on_when_it_comes(monkeypatch)
     monkeypatch.setattr("saccade.shared.loop.main.IDLE_S", 0.05)
     with closing(Running("local", names=("planner",))) as running:
         running.until_status("planner", lambda s: s.state == "ready")
-        running.listener.publish(BELIEF, "can", encode(sample(BELIEF.type, object="can", step=0)))
+        running.listener.publish(BELIEF, "can", encode(sample(BELIEF.type, run="r", object="can", step=0)))
         running.until_status("planner", lambda s: s.note == "waits for belief/mug of step 0 of episode 3")
-        running.listener.publish(BELIEF, "mug", encode(sample(BELIEF.type, object="mug", step=0)))
+        running.listener.publish(BELIEF, "mug", encode(sample(BELIEF.type, run="r", object="mug", step=0)))
         running.until(lambda t, p, b: t == ACTION)
         running.until_status("planner", lambda s: s.note == "")
 
@@ -226,7 +227,7 @@ def test_lost_messages_show_in_the_status():
     with closing(Running("local", names=("evaluator",))) as running:
         running.until_status("evaluator", lambda s: s.state == "ready")
         for seq in (0, 1, 5):
-            running.listener.publish(TRUTH, None, encode(sample(TRUTH.type, step=seq, seq=seq, done=False)))
+            running.listener.publish(TRUTH, None, encode(sample(TRUTH.type, run="r", step=seq, seq=seq, done=False)))
         _, status = running.until_status("evaluator", lambda s: s.received == 3)
         assert status.gaps == 3
 
@@ -244,22 +245,28 @@ class Saying:
         return self.outputs
 
 
-def test_a_core_that_gives_an_invalid_message_publishes_nothing_of_that_step():
+def test_a_core_that_gives_an_invalid_message_ends_with_a_reason_and_publishes_nothing_of_that_step():
     bad = [Output(PLAN, sample(PLAN.type)), Output(PLAN, sample(PLAN.type, g_pose=float("nan")))]
     bus, inbox, seen = LocalBus(), Inbox(), queue.SimpleQueue()
     bus.subscribe([PLAN, STATUS], lambda *item: seen.put(item))
     service = Service("bad", inputs=(TRUTH,), trigger=TRUTH, outputs=(PLAN,))
-    thread = threading.Thread(target=lambda: serve(service, Saying(bad), bus, PARTS, run="r", inbox=inbox))
-    thread.start()
+    ended: queue.SimpleQueue = queue.SimpleQueue()
+
+    def run() -> None:
+        try:
+            ended.put(serve(service, Saying(bad), bus, PARTS, run="r", inbox=inbox))
+        except SaccadeError as error:
+            ended.put(error)
+
+    threading.Thread(target=run, daemon=True).start()
     while decode(Status, seen.get(timeout=WAIT_S)[2]).state != "ready":
         pass
-    bus.publish(TRUTH, None, encode(sample(TRUTH.type, step=0)))
-    while (status := decode(Status, seen.get(timeout=WAIT_S)[2])).refused == 0:
-        pass
-    inbox.stop()
-    thread.join(WAIT_S)
-    assert "invalid plan: g_pose: not a finite number" in status.note
-    assert status.published == 0
+    bus.publish(TRUTH, None, encode(sample(TRUTH.type, run="r", step=0)))
+    assert "bad gives an invalid plan: g_pose: not a finite number" in str(ended.get(timeout=WAIT_S))
+    said = []
+    while not seen.empty():
+        said.append(seen.get())
+    assert {topic for topic, _, _ in said} == {STATUS}
 
 
 def test_a_run_that_halts_says_who_waits_for_what():

@@ -44,3 +44,24 @@ def test_a_status_counts_anew_in_a_process_that_was_started_again():
     lost = [sequences.take(STATUS, "belief", sample(STATUS.type, seq=seq)) for seq in (7, 8, 0, 1, 3)]
     assert lost == [0, 0, 0, 0, 1]
     assert sequences.missing == {}
+
+
+def test_a_number_far_ahead_takes_no_memory_and_what_is_before_it_may_still_come():
+    sequences = Sequences(from_start=True)
+    assert take(sequences, (0, 0), (0, 2 ** 62)) == [0, 2 ** 62 - 1]
+    assert sequences.missing == {("percept", "mug"): 2 ** 62 - 1}
+    assert take(sequences, (0, 1), (0, 1), (0, 2 ** 61), (0, 2)) == [0, None, 0, 0]
+    assert sequences.missing == {("percept", "mug"): 2 ** 62 - 4}
+    assert take(sequences, (0, 2 ** 62 + 5)) == [4]
+
+
+def test_what_was_missing_before_a_publisher_counts_anew_stays_missing():
+    sequences = Sequences()
+
+    def at(seq, step):
+        return sequences.take(PERCEPT, "mug", sample(PERCEPT.type, run="r", episode=0, seq=seq, step=step))
+
+    assert [at(0, 0), at(3, 3), at(0, 9), at(2, 11)] == [0, 2, 0, 1]
+    assert sequences.missing == {("percept", "mug"): 3}
+    assert [at(1, 10), at(1, 10)] == [0, None]
+    assert sequences.missing == {("percept", "mug"): 2}

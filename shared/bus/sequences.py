@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from bisect import bisect_right
 
 from saccade.shared.bus.messages import Message
 from saccade.shared.bus.topics import Output, Topic
@@ -30,6 +31,34 @@ class Stamper:
         return dataclasses.replace(output, message=dataclasses.replace(output.message, seq=seq))
 
 
+class Missing:
+    """Which numbers of one key in one episode have not come, as ranges: memory grows with what came, not with what a
+    number claims."""
+
+    def __init__(self) -> None:
+        self._ranges: list[tuple[int, int]] = []  # [first, end) in rising order, apart from one another
+        self.count = 0
+
+    def add(self, first: int, end: int) -> None:
+        """Numbers beyond all that are known."""
+        self._ranges.append((first, end))
+        self.count += end - first
+
+    def give_up(self) -> None:
+        """Numbers are counted anew: those that are missing still count, and will not come."""
+        self._ranges = []
+
+    def remove(self, number: int) -> bool:
+        """Whether the number was missing; it is no longer."""
+        at = bisect_right(self._ranges, number, key=lambda known: known[0]) - 1
+        if at < 0 or number >= self._ranges[at][1]:
+            return False
+        first, end = self._ranges[at]
+        self._ranges[at:at + 1] = [part for part in ((first, number), (number + 1, end)) if part[0] < part[1]]
+        self.count -= 1
+        return True
+
+
 class Sequences:
     """Which messages of each key were there. What is missing may still come, out of its turn.
 
@@ -43,7 +72,7 @@ class Sequences:
         self._cut = cut  # whether every episode may begin at any number
         self._next: dict[Key, dict[Episode, int]] = {}
         self._last_step: dict[tuple[Key, Episode], int] = {}
-        self._missing: dict[Key, set[tuple[str, int, int]]] = {}
+        self._missing: dict[Key, dict[Episode, Missing]] = {}
 
     def take(self, topic: Topic, part: str | None, message: Message | Stamp) -> int | None:
         """How many messages of this key are missing just before this one; None for one that was there already."""
@@ -59,26 +88,26 @@ class Sequences:
         self._last_step[key, episode] = max(last_step, message.step)
         if seq < due and message.step > last_step:
             due = 0
+            self._missing.get(key, {}).get(episode, Missing()).give_up()
         if seq >= due:
             episodes[episode] = seq + 1
             if seq > due:
-                self._missing.setdefault(key, set()).update((*episode, lost) for lost in range(due, seq))
+                self._missing.setdefault(key, {}).setdefault(episode, Missing()).add(due, seq)
             return seq - due
-        missing = self._missing.get(key, set())
-        if (*episode, seq) not in missing:
-            return None
-        missing.discard((*episode, seq))
-        return 0
+        missing = self._missing.get(key, {}).get(episode)
+        return 0 if missing is not None and missing.remove(seq) else None
 
     @property
     def missing(self) -> dict[Key, int]:
         """How many messages of each key have not come."""
-        return {key: len(lost) for key, lost in self._missing.items() if lost}
+        counts = {key: sum(missing.count for missing in episodes.values()) for key, episodes in self._missing.items()}
+        return {key: count for key, count in counts.items() if count}
 
     @property
     def first_missing(self) -> int:
         """The first episode of which something has not come; 0 where all has."""
-        return min((episode for lost in self._missing.values() for _, episode, _ in lost), default=0)
+        return min((episode for episodes in self._missing.values() for (_, episode), missing in episodes.items()
+                    if missing.count), default=0)
 
     def has_begun(self, key: Key, run: str, episode: int) -> bool:
         """Whether any message of this key in that episode was there."""

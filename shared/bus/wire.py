@@ -17,17 +17,26 @@ import msgpack
 import numpy as np
 
 from saccade.shared.bus.messages import AnyMessage, ArraySpec, Message, field_types
+from saccade.shared.errors import printable
 
 ARRAY_EXTENSION = 1  # msgpack ext type: msgpack([dtype, shape]) followed by the array's bytes, row-major
 MAX_SIDE = 8192
 MAX_BYTES = 32 * 1024 * 1024
-MAX_TEXT = 4096
+MAX_SMALL_BYTES = 1024 * 1024  # of a message without an image
+MAX_TEXT = 4096  # bytes
+MAX_LIST = 256
+MAX_FIELDS = 64
+MAX_NAME = 64  # bytes of a field's name
+MAX_REASON = 200  # characters
 HEADER_BYTES = 128  # of an array: more than any needs
 STAMP_BYTES = 512  # and of the fields that all messages have
 
 
 class MessageError(ValueError):
-    """A payload that is not a valid message; the text names the field."""
+    """A payload that is not a valid message; the text names the field. It is short and can be printed."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(printable(text, MAX_REASON))
 
 
 def _pack_array(value: Any) -> msgpack.ExtType:
@@ -58,7 +67,9 @@ def encode(message: Message) -> bytes:
     """The wire bytes of a message; checks it first, so that no service can publish what another must refuse."""
     fields = {f.name: getattr(message, f.name) for f in dataclasses.fields(message)}
     _check(type(message), fields)
-    return msgpack.packb({"type": type(message).__name__, "version": message.VERSION, **fields}, default=_pack_array)
+    payload = msgpack.packb({"type": type(message).__name__, "version": message.VERSION, **fields}, default=_pack_array)
+    _check_size(type(message), payload)
+    return payload
 
 
 class Stamp(NamedTuple):
@@ -80,26 +91,30 @@ def stamp_of(payload: bytes) -> Stamp:
         stamp = Stamp(*(fields[name] for name in Stamp._fields))
     except Exception as error:  # msgpack raises many kinds for bytes that are not msgpack
         raise MessageError(f"does not begin with a stamp ({type(error).__name__})") from error
-    if [type(value) for value in stamp] != [str, int, int, int]:
+    if [type(value) for value in stamp] != [str, int, int, int] or not all(0 <= n < 2 ** 63 for n in stamp[1:]):
         raise MessageError("does not begin with a stamp")
     return stamp
 
 
 def decode(message_type: type[AnyMessage], payload: bytes) -> AnyMessage:
     """The message in `payload`. Raises MessageError with the field that is wrong."""
-    if len(payload) > MAX_BYTES:
-        raise MessageError(f"{len(payload)} bytes, more than {MAX_BYTES}")
+    _check_size(message_type, payload)
+    count = scan(payload)
     try:
-        fields = msgpack.unpackb(payload, ext_hook=_unpack_array, max_str_len=MAX_TEXT, max_array_len=256,
-                                 max_map_len=64, strict_map_key=True)
+        fields = msgpack.unpackb(payload, ext_hook=_unpack_array, max_str_len=MAX_TEXT, max_array_len=MAX_LIST,
+                                 max_map_len=MAX_FIELDS, strict_map_key=True)
     except MessageError:
         raise
     except Exception as error:  # msgpack raises many kinds for bytes that are not msgpack
         raise MessageError(f"not msgpack ({type(error).__name__})") from error
-    if not isinstance(fields, dict) or fields.pop("type", None) != message_type.__name__:
+    if len(fields) != count:
+        raise MessageError("a field is there twice")
+    name, version = fields.pop("type", None), fields.pop("version", None)
+    if type(name) is not str or name != message_type.__name__:
         raise MessageError(f"type: not a {message_type.__name__}")
-    if (version := fields.pop("version", None)) != message_type.VERSION:
-        raise MessageError(f"version: {version!r}, not {message_type.VERSION}: it comes from another release")
+    if type(version) is not int or version != message_type.VERSION:
+        told = version if type(version) is int else type(version).__name__
+        raise MessageError(f"version: {told}, not {message_type.VERSION}: it comes from another release")
     _check(message_type, fields)
     return message_type(**fields)
 
@@ -135,12 +150,97 @@ def _check_field(name: str, value: Any, kind: Any, dimensions: dict[str, int]) -
         if not isinstance(value, (float, int)) or isinstance(value, bool) or not math.isfinite(value):
             raise MessageError(f"{name}: not a finite number")
     elif kind == list[str]:
-        if not isinstance(value, list) or not all(isinstance(v, str) for v in value):
-            raise MessageError(f"{name}: not a list of texts")
+        if not isinstance(value, list) or len(value) > MAX_LIST or not all(isinstance(v, str) for v in value):
+            raise MessageError(f"{name}: not a list of at most {MAX_LIST} texts")
+        for text in value:
+            _check_text(name, text)
     elif type(value) is not kind:
         raise MessageError(f"{name}: {type(value).__name__}, not {kind.__name__}")
+    elif kind is str:
+        _check_text(name, value)
     elif kind is int and not 0 <= value < 2 ** 63:
         raise MessageError(f"{name}: out of range")
+
+
+def _check_text(name: str, text: str) -> None:
+    try:
+        size = len(text) if text.isascii() else len(text.encode())
+    except UnicodeEncodeError as error:
+        raise MessageError(f"{name}: a text that is no Unicode") from error
+    if size > MAX_TEXT:
+        raise MessageError(f"{name}: a text of {size} bytes, more than {MAX_TEXT}")
+
+
+def _check_size(message_type: type[Message], payload: bytes) -> None:
+    limit = MAX_BYTES if _holds_image(message_type) else MAX_SMALL_BYTES
+    if len(payload) > limit:
+        raise MessageError(f"{len(payload)} bytes, more than {limit}")
+
+
+@functools.cache
+def _holds_image(message_type: type[Message]) -> bool:
+    return any(isinstance(kind, ArraySpec) and "H" in kind.shape for _, kind in _checks(message_type).values())
+
+
+# What a byte of MessagePack begins: a kind, how many bytes tell its size, and its size where none does.
+_HEADS = {
+    0xC0: ("nil", 0, 0), 0xC2: ("bool", 0, 0), 0xC3: ("bool", 0, 0), 0xCA: ("number", 0, 4), 0xCB: ("number", 0, 8),
+    **{0xCC + n: ("number", 0, 2 ** n) for n in range(4)}, **{0xD0 + n: ("number", 0, 2 ** n) for n in range(4)},
+    **{0xC4 + n: ("bytes", 2 ** n, 0) for n in range(3)}, **{0xC7 + n: ("array", 2 ** n, 0) for n in range(3)},
+    **{0xD4 + n: ("array", 0, 2 ** n) for n in range(5)}, **{0xD9 + n: ("text", 2 ** n, 0) for n in range(3)},
+    0xDC: ("list", 2, 0), 0xDD: ("list", 4, 0), 0xDE: ("map", 2, 0), 0xDF: ("map", 4, 0),
+    **{n: ("number", 0, 0) for n in (*range(0x80), *range(0xE0, 0x100))},
+    **{0x80 + n: ("map", 0, n) for n in range(16)}, **{0x90 + n: ("list", 0, n) for n in range(16)},
+    **{0xA0 + n: ("text", 0, n) for n in range(32)},
+}
+
+
+def scan(payload: bytes) -> int:
+    """How many fields a payload has. Raises MessageError unless it is one map of names to numbers, truth values, texts,
+    lists of texts and arrays, within the limits. Looks at heads alone and builds nothing, however long the payload."""
+    kind, count, at = _head(payload, 0)
+    if kind != "map" or count > MAX_FIELDS:
+        raise MessageError(f"not a map of at most {MAX_FIELDS} fields")
+    for _ in range(count):
+        kind, size, at = _head(payload, at)
+        if kind != "text" or size > MAX_NAME:
+            raise MessageError(f"a field's name is not a text of at most {MAX_NAME} bytes")
+        name, start = payload[at:at + size], at + size
+        kind, size, at = _head(payload, start)
+        if kind in ("map", "bytes"):
+            raise _named(name, f"{kind}, which no message has")
+        items = 0
+        if kind == "list":
+            items, size = size, 0
+        if items > MAX_LIST:
+            raise _named(name, f"a list of {items}, more than {MAX_LIST}")
+        for _ in range(items):
+            kind, length, at = _head(payload, at)
+            if kind != "text":
+                raise _named(name, f"a list that holds {kind}, not texts")
+            at += length
+        at += size
+    if at != len(payload):
+        raise MessageError(f"{len(payload)} bytes, where its fields take {at}")
+    return count
+
+
+def _named(name: bytes, what: str) -> MessageError:
+    return MessageError(f"{name.decode(errors='replace')}: {what}")
+
+
+def _head(payload: bytes, at: int) -> tuple[str, int, int]:
+    """What begins at a place: its kind, its size (bytes, or items of a list or map), and where its content begins."""
+    if at >= len(payload):
+        raise MessageError("ends early")
+    kind, width, size = _HEADS.get(payload[at], ("nothing", 0, 0))
+    if kind == "nothing":
+        raise MessageError("not msgpack")
+    if width:
+        size = int.from_bytes(payload[at + 1:at + 1 + width], "big")
+    if kind == "text" and size > MAX_TEXT:
+        raise MessageError(f"a text of {size} bytes, more than {MAX_TEXT}")
+    return kind, size + (kind == "array"), at + 1 + width
 
 
 def _check_array(name: str, value: Any, spec: ArraySpec, dimensions: dict[str, int]) -> None:

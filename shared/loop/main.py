@@ -70,7 +70,7 @@ def serve(service: Service, core: Core, bus: Bus, parts: tuple[str, ...], *, run
     goes on with the newest.
     """
     inbox, source = inbox or Inbox(), hasattr(core, "episodes")
-    stepper = Stepper(service, core, parts, source=source, live=live, first_step=first_step)
+    stepper = Stepper(service, core, parts, source=source, live=live, first_step=first_step, run=run)
     loop = _Loop(stepper, bus, run, wait_for if source else (), live=live)
     bus.answer(service.outputs, loop.outbox.answer)
     bus.subscribe(loop.topics + ((STATUS,) if loop.awaited else ()) + loop.watched, inbox.put)
@@ -291,7 +291,10 @@ class _Loop:
             try:
                 encoded.append(encode(output.message))
             except MessageError as error:
-                raise MessageError(f"gives an invalid {output.topic.name}: {error}") from error
+                said = f"gives an invalid {output.topic.name}: {error}"
+                if self._live:
+                    raise MessageError(said) from error
+                raise SaccadeError(f"{self.health.service} {said}; the run cannot go on without it") from error
         for output, payload in zip(outputs, encoded, strict=True):
             self.outbox.keep(output.topic, output.part, output.message, payload)
             if self._share:

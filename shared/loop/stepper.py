@@ -31,11 +31,12 @@ class Stepper:
     taken, from the first (`first_step`; a log that was cut begins later): a core's state is a fold over all of them,
     and what is lacking can be asked for (`wants`). `live`, the newest complete step is taken and those before it are
     skipped. A latched message of step s holds from step s of its episode. `parts` are the names of the run's objects.
-    For a source, `begin` starts an episode, and the inputs must answer the step it published last.
+    For a source, `begin` starts an episode, and the inputs must answer the step it published last. With `run`, messages
+    of other runs are refused.
     """
 
     def __init__(self, service: Service, core: Core, parts: tuple[str, ...], *, source: bool = False,
-                 live: bool = False, first_step: int = 0) -> None:
+                 live: bool = False, first_step: int = 0, run: str | None = None) -> None:
         if service.trigger not in service.inputs:
             raise SaccadeError(f"service {service.name}: its trigger {service.trigger.name} is not among its inputs")
         self.service, self.parts = service, parts
@@ -43,7 +44,7 @@ class Stepper:
         self.skipped = 0  # steps that never became complete
         self.episode_done = source  # a source is between episodes
         self.at: tuple[str, int, int] = ("", 0, 0)  # run, episode, step last begun or stepped
-        self._source, self._live, self._first_step = source, live, first_step
+        self._source, self._live, self._first_step, self._run = source, live, first_step, run
         self._begun: Episode | None = None
         self._past_runs: set[str] = set()
         self._last_step = -1  # of the current episode
@@ -62,6 +63,7 @@ class Stepper:
             raise MessageError(f"part: {part!r} is not an object of this run")
         if topic.parts and (named := getattr(message, "object", part)) != part:
             raise MessageError(f"object: {named!r} under the key of {part!r}")
+        self._require_of_this_run(message)
         if self._late(message, topic):
             return
         message = settle(message)
@@ -126,6 +128,16 @@ class Stepper:
             at = (*at[:2], min(at[2], due))
         return [f"{name if part is None else f'{name}/{part}'} of step {at[2]} of episode {at[1]}"
                 for name, part in self._lacks(at)]
+
+    def _require_of_this_run(self, message: Message) -> None:
+        """Raises MessageError for a message of another run, or of an episode after the next: episodes follow one
+        another."""
+        if self._run is None:
+            return
+        if message.run != self._run:
+            raise MessageError(f"run: {message.run!r}, not this run {self._run!r}")
+        if self._begun is not None and message.episode > self._begun[1] + 1:
+            raise MessageError(f"episode: {message.episode}, while episode {self._begun[1]} goes on")
 
     def _late(self, message: Message, topic: Topic) -> bool:
         if message.run in self._past_runs:
