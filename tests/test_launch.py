@@ -152,6 +152,7 @@ def test_an_interrupted_launcher_leaves_no_process_and_a_readable_log(tmp_path, 
         assert report.cut is None
         assert report.lost == {}
         assert report.messages > 0
+        assert report.unfinished.startswith("the run was not finished: it was ended in episode 0")
     finally:
         launcher.kill()
         launcher.stdout.close()

@@ -104,6 +104,7 @@ class Copy:
         self._schemas: dict[int, Schema] = {}
         self._found, self._channels = channels, dict(channels)
         self._ids: dict[str, int] = {}  # in the new file, of what a channel or a schema says
+        self._known: dict[int, tuple[Channel, Schema | None, int]] = {}  # by its id, the newest and its new one
 
     def take(self, record: McapRecord) -> None:
         """Appends one record; schemas and channels are written once they have a message."""
@@ -138,6 +139,9 @@ class Copy:
 
     def _channel(self, channel: Channel) -> int:
         schema = self._schemas.get(channel.schema_id)
+        known = self._known.get(channel.id)
+        if known is not None and known[0] is channel and known[1] is schema:
+            return known[2]
         about = repr((channel, schema))
         if about not in self._ids:
             if schema is None and is_key(channel.topic):
@@ -146,6 +150,7 @@ class Copy:
                 channel.topic, channel.message_encoding, self._schema(schema), channel.metadata)
             if is_key(channel.topic):
                 self._writer.add_metadata(KEY, key_metadata(new, channel.topic))
+        self._known[channel.id] = channel, self._schemas.get(channel.schema_id), self._ids[about]
         return self._ids[about]
 
     def _schema(self, schema: Schema | None) -> int:

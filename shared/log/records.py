@@ -22,6 +22,7 @@ from saccade.shared.bus.wire import MAX_BYTES
 MAX_PAYLOAD_BYTES = 2 * MAX_BYTES  # what a log takes: more than any valid message has
 MAX_CHUNK_BYTES = 4 * MAX_BYTES  # of a chunk, once it is decompressed
 MAX_RECORD_BYTES = 256 * 1024 * 1024
+MAX_ATTACHMENT_BYTES = 64 * 1024 * 1024
 MAX_NOTE_BYTES = 1024 * 1024  # of what becomes many small objects: metadata, channels
 MOST_OPENED_BYTES, MOST_TIMES = 1024 ** 3, 500  # beyond the first, chunks may open to so many times what they take
 
@@ -33,12 +34,14 @@ DAMAGE = (McapError, struct.error, zstandard.ZstdError, ValueError, OverflowErro
 
 TYPES: dict[int, Any] = {
     opcode: getattr(mcap, "".join(word.title() for word in opcode.name.split("_"))) for opcode in Opcode}
-LARGE = (Opcode.CHUNK, Opcode.MESSAGE, Opcode.ATTACHMENT, Opcode.MESSAGE_INDEX)
+LARGE = (Opcode.CHUNK, Opcode.MESSAGE, Opcode.MESSAGE_INDEX)
 WANTED = (Opcode.HEADER, Opcode.CHANNEL, Opcode.ATTACHMENT, Opcode.METADATA)
 
 
 def limit_of(opcode: int) -> int:
     """How many bytes a record of that kind may have."""
+    if opcode == Opcode.ATTACHMENT:
+        return MAX_ATTACHMENT_BYTES
     return MAX_RECORD_BYTES if opcode in LARGE or opcode not in TYPES else MAX_NOTE_BYTES
 
 
