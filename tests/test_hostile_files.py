@@ -11,14 +11,19 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from saccade.app import api
 from saccade.app.bench.failures import _file_name
 from saccade.app.bench.repeat import read_results
 from saccade.app.bench.table import render
 from saccade.app.cli.texts import parse_value
+from saccade.app.look.echo import block
+from saccade.app.look.hz import _table
+from saccade.app.look.listen import Heard
+from saccade.app.look.topics import registry
 from saccade.app.run.display import Progress, line, panel, say
 from saccade.shared import files
 from saccade.shared.bus.messages import Belief, Plan, Status, Truth
-from saccade.shared.bus.topics import BELIEF, PLAN, STATUS, TRUTH
+from saccade.shared.bus.topics import BELIEF, PERCEPT, PLAN, STATUS, TRUTH
 from saccade.shared.config import MAX_FILE_BYTES, Config, load, recorded
 from saccade.shared.errors import LINE_LIMIT, SaccadeError, printable, told
 from saccade.shared.files import opened, parse_json, parse_toml, read_text
@@ -108,6 +113,15 @@ def test_results_that_are_none_are_refused(tmp_path, text):
         text = json.dumps({**facts, "results": [record(scene=HOSTILE)]})
     (tmp_path / "r.json").write_text(text)
     assert f"results {tmp_path / 'r.json'} are not of `saccade bench`" in complaint(read_results, tmp_path / "r.json")
+
+
+def test_tables_of_keys_show_names_that_do_nothing():
+    """The last part of a key is anybody's."""
+    text = shown(_table([(f"saccade/table/percept/{HOSTILE}", *"12345")]), registry(HOSTILE))
+    assert text.replace("\n", "").isprintable()
+    assert "[/x]" in text
+    heard = Heard(PERCEPT, HOSTILE[:50], b"", 0)
+    assert all(told.replace("\n", "").isprintable() for told in block(heard, HOSTILE[:50]))
 
 
 # Files of any kind.
@@ -225,7 +239,8 @@ def test_a_broken_configuration_in_a_log_is_refused(tmp_path, text):
     assert "the log run.mcap" in complaint(recorded, text, "the log run.mcap")
 
 
-@pytest.mark.parametrize("command", [("film", "out.gif"), ("picture",), ("view", "--save", "out.rrd")])
+@pytest.mark.parametrize("command", [("film", "out.gif"), ("picture",), ("view", "--save", "out.rrd"),
+                                     ("replay", "--into", "belief", "--out", "out")])
 def test_a_log_with_a_broken_configuration_is_refused(monkeypatch, capsys, tmp_path, command):
     monkeypatch.chdir(tmp_path)
     write_log(tmp_path / "run.mcap", configuration=BROKEN["zeros"])
@@ -234,3 +249,13 @@ def test_a_log_with_a_broken_configuration_is_refused(monkeypatch, capsys, tmp_p
     assert code == 2
     assert err.splitlines()[-1].startswith("saccade: the configuration in the log run.mcap is damaged")
     assert os.listdir(tmp_path) == ["run.mcap"]
+
+
+@pytest.mark.parametrize("text", [BROKEN["deep"], BROKEN["a list"]], ids=["deep", "a list"])
+def test_a_log_with_a_broken_configuration_is_opened_and_exported(monkeypatch, capsys, tmp_path, text):
+    """Its messages are good; who asks for the configuration is told."""
+    write_log(tmp_path / "run.mcap", configuration=text)
+    assert f"the log {tmp_path / 'run.mcap'}" in complaint(lambda: api.open(tmp_path / "run.mcap").config)
+    code, out, _ = call(monkeypatch, capsys, "log", "export", tmp_path / "run.mcap", "--out", tmp_path / "out.mcap")
+    assert code == 0
+    assert "messages written" in out

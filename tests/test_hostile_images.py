@@ -8,6 +8,7 @@ import struct
 import zlib
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -153,6 +154,17 @@ def test_a_folder_of_too_many_entries_is_refused(tmp_path, monkeypatch):
     assert "more than 5 images" in complaint(Folder, tmp_path)
     monkeypatch.setattr(sources, "MAX_ENTRIES", 3)
     assert "or 3 entries" in complaint(Folder, tmp_path)
+
+
+def test_a_video_of_too_many_pixels_is_refused_by_its_header(tmp_path, monkeypatch):
+    path = tmp_path / "a.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10.0, (64, 48))
+    writer.write(np.zeros((48, 64, 3), np.uint8))
+    writer.release()
+    assert open_source(str(path)).size_px == (64, 48)
+    monkeypatch.setattr(sources, "MAX_PIXELS", 64 * 48 - 1)
+    monkeypatch.setattr(sources, "_size", None)  # nothing is made of a frame
+    assert "has 64x48 pixels, more than" in complaint(open_source, str(path))
 
 
 POSE = json.dumps(np.eye(4).tolist())

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from saccade.app.cli.options import wide
+from saccade.shared.errors import LINE_LIMIT, printable
 
 EXIT_INCOMPLETE = 1
 
@@ -38,8 +40,7 @@ def check(run: Run) -> None:
     from saccade.app.log.source import log_of
 
     report = missing(log_of(run))
-    for line in report.lines():
-        print(line)
+    _tell(report.lines())
     if not report.complete:
         raise typer.Exit(EXIT_INCOMPLETE)
     print(f"complete: {report.messages} messages")
@@ -55,8 +56,7 @@ def recover(run: Run, out: Out) -> None:
     report = recover_log(log_of(run), out)
     lost = [*report.lines(), *missing(out).lines()]
     print(f"{report.messages} messages written to {out}; " + ("it lacks:" if lost else "nothing is missing"))
-    for line in lost:
-        print(line)
+    _tell(lost)
 
 
 @app.command()
@@ -71,8 +71,13 @@ def cut(run: Run, out: Out,
 
     kept = cut_log(log_of(run), out, episode=episode, start=start, end=end)
     print(f"{kept} written to {out}")
-    for line in missing(out).lines():
-        print(line)
+    _tell(missing(out).lines())
+
+
+def _tell(lines: Iterable[str]) -> None:
+    """Prints lines in which there may be names from a log."""
+    for line in lines:
+        print(printable(line, LINE_LIMIT))
 
 
 @app.command()

@@ -64,7 +64,7 @@ def _say_dropped(source: Live | Logged, told: int, write: Callable[[str], Any]) 
 def block(heard: Heard, world: str) -> Iterator[str]:
     """Yields the lines of one message."""
     when = datetime.fromtimestamp(heard.time_ns / 1e9, UTC).strftime("%H:%M:%S.%f")[:-3]
-    title = f"{heard.topic.key(world, heard.part)}  {when} UTC, {len(heard.payload):,} bytes"
+    title = f"{text(heard.topic.key(world, heard.part))}  {when} UTC, {len(heard.payload):,} bytes"
     try:
         message = decode(heard.topic.type, heard.payload)
     except MessageError as error:

@@ -18,7 +18,7 @@ from rich.table import Table
 
 from saccade.app.log.source import log_of
 from saccade.app.look.listen import TICK_S, Live, Logged, Wanted, live, until_interrupted
-from saccade.app.run.display import say
+from saccade.app.run.display import cell, say
 from saccade.shared.bus.topics import Topic
 
 WINDOW_S = 10.0
@@ -126,7 +126,7 @@ def _table(rows: list[tuple[str, ...]]) -> Table:
     for header in ("key", "messages", "Hz", "interval ms", "jitter ms", "bytes/s"):
         table.add_column(header, justify="left" if header == "key" else "right", no_wrap=True)
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*map(cell, row))
     return table
 
 

@@ -14,7 +14,7 @@ from saccade.app.log.info import gather
 from saccade.app.log.source import log_of
 from saccade.app.log.traffic import Keys
 from saccade.app.look.listen import Live, Wanted, live, until_interrupted
-from saccade.app.run.display import say
+from saccade.app.run.display import cell, say
 from saccade.shared.bus.topics import ROOT, TOPICS, Topic
 from saccade.shared.bus.wire import MessageError, stamp_of
 from saccade.shared.config import Config
@@ -47,7 +47,7 @@ def registry(world: str) -> Table:
         often = "once an episode" if topic.latched else "every step" if topic.in_step else "twice a second"
         about = (topic.type.__doc__ or "").strip().split("\n")[0]
         key = topic.key(world, "<part>" if topic.parts else None)
-        table.add_row(topic.name, key, topic.type.__name__, often, about)
+        table.add_row(topic.name, cell(key), topic.type.__name__, often, about)
     return table
 
 

@@ -18,12 +18,17 @@ from saccade.shared.loop.process import REFUSED
 
 LINE_EVERY = 10  # in plain mode, a line is printed every so many steps
 PER_SECOND = 8
-SHORT = 80  # characters of a name in the live display
+SHORT = 120  # characters of a name in a table
 
 
 def say(console: Console, text: str) -> None:
     """Prints a line as it is, without wrapping and without colours."""
     console.print(printable(text, LINE_LIMIT), markup=False, highlight=False, soft_wrap=True)
+
+
+def cell(text: str) -> Text:
+    """A name from outside in a table: in a text nothing is markup."""
+    return Text(printable(text, SHORT))
 
 
 class Progress:
@@ -114,8 +119,8 @@ def _plan_table(progress: Progress) -> Table:
                       f"{_metres(progress.believed_distance_m)} as believed")
     if (plan := progress.plan) is not None:
         x, y, z = plan.viewpoint[:3, 3]
-        aim = Text(printable(f"{plan.mode} {plan.target}".strip(), SHORT))  # in a text nothing is markup
-        table.add_row("viewpoint", f"({x:.2f}, {y:.2f}, {z:.2f}) m", aim)
+        aim = f"{plan.mode} {plan.target}".strip()
+        table.add_row("viewpoint", f"({x:.2f}, {y:.2f}, {z:.2f}) m", cell(aim))
         table.add_row("G", f"{plan.g:.2f} nats", f"position {plan.g_position:.2f}  scale {plan.g_scale:.2f}  "
                       f"pose {plan.g_pose:.2f}  information {plan.g_information:.2f}")
     return table
@@ -129,7 +134,7 @@ def _belief_table(progress: Progress) -> RenderableType:
         table.add_column(header, justify="left" if header == "object" else "right")
     for name, belief in sorted(progress.beliefs.items()):
         x, y, z = belief.mean_m
-        table.add_row(Text(printable(name, SHORT)), f"{belief.presence:.2f}", f"{x:.2f}, {y:.2f}, {z:.2f}",
+        table.add_row(cell(name), f"{belief.presence:.2f}", f"{x:.2f}, {y:.2f}, {z:.2f}",
                       f"{spread_cm(belief):.1f}", str(belief.views), style="" if belief.presence > 0.5 else "dim")
     return table
 

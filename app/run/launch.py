@@ -21,7 +21,7 @@ from saccade.shared.bus.topics import PLAN, RESULT, STATUS, Topic
 from saccade.shared.bus.transport import Bus, ZenohBus, free_endpoint
 from saccade.shared.bus.wire import MessageError, decode
 from saccade.shared.config import Config
-from saccade.shared.errors import SaccadeError
+from saccade.shared.errors import LINE_LIMIT, SaccadeError, printable
 from saccade.shared.log.folder import CONFIG_NAME, LOG_NAME, LOGS_NAME
 from saccade.shared.loop.main import READY_STATES
 from saccade.shared.loop.process import Item
@@ -79,7 +79,7 @@ def launched(config: Config, run_dir: Path, on_message: OnMessage | None = None,
         graph.supervisor.stop(onlookers=False)
         _drain(graph.messages, on_message)
         for complaint in graph.supervisor.complaints():  # such as a full disk
-            print(f"saccade: {complaint}", file=sys.stderr)
+            print(f"saccade: {printable(complaint, LINE_LIMIT)}", file=sys.stderr)
         yield Ended(results, graph.supervisor.runs)
 
 
@@ -120,7 +120,7 @@ def running(config: Config, run_dir: Path, processes: Sequence[Process], topics:
     arrived: queue.SimpleQueue[Item] = queue.SimpleQueue()
     with ExitStack() as stack:
         stack.enter_context(_terminable())
-        supervisor = Supervisor(run_dir, say or (lambda text: print(f"saccade: {text}", file=sys.stderr)))
+        supervisor = Supervisor(run_dir, say or (lambda text: print(f"saccade: {printable(text)}", file=sys.stderr)))
         stack.callback(supervisor.stop)
         supervisor.start(processes[0])
         bus = ZenohBus(config.bus.endpoint, world=config.bus.world)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from saccade.shared.errors import SaccadeError
-from saccade.shared.world.images import Size, image_size, read_image
+from saccade.shared.world.images import MAX_PIXELS, Size, image_size, read_image
 
 MAX_IMAGES, MAX_ENTRIES = 100_000, 1_000_000  # of a folder
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -159,6 +159,11 @@ class Video:
 
     def _begin(self) -> tuple[Any, NDArray[np.uint8]]:
         capture = _capture(self.name)
+        width, height = (capture.get(what) for what in (_cv2().CAP_PROP_FRAME_WIDTH, _cv2().CAP_PROP_FRAME_HEIGHT))
+        if width * height > MAX_PIXELS:  # told by the header, before one is decoded
+            capture.release()
+            raise SaccadeError(f"video {self._path} has {width:.0f}x{height:.0f} pixels, more than {MAX_PIXELS}: "
+                               "give a smaller one")
         read, bgr = capture.read()
         if not read:
             capture.release()
