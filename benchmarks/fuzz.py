@@ -29,8 +29,8 @@ EVERY = 50_000  # payloads, after which progress is told
 WORDS = ("", "x", "\x1b[2J", "\u202e", "type", "version", "run", "x" * 5000, "\x00", "Status", "__class__")
 NUMBERS = (0, 1, -1, 2 ** 31, 2 ** 62, 2 ** 63, 2 ** 64 - 1, -2 ** 63, 1e308, -1e308, 1e-320, float("nan"),
            float("inf"))
-HEADERS = (["f8", [2]], ["f8", [2 ** 40]], ["f4", [-1]], ["O", [1]], ["f8", "2"], ["f8", [[2]]], ["f8"], {},
-           ["u1", [0] * 9], ["f8", [2.0]], [b"f8", [2]], [["f8"], [2]], ["f8", [None]], ["<f8", [2]])
+HEADERS: tuple[Any, ...] = (["f8", [2]], ["f8", [2 ** 40]], ["f4", [-1]], ["O", [1]], ["f8", "2"], ["f8", [[2]]],
+           ["f8"], {}, ["u1", [0] * 9], ["f8", [2.0]], [b"f8", [2]], [["f8"], [2]], ["f8", [None]], ["<f8", [2]])
 
 
 def _value(rng: random.Random, depth: int = 0) -> Any:
@@ -145,7 +145,8 @@ def trial(topic: Topic, payload: bytes, migrate: Migration) -> str:
 
 def fuzz(payloads: int, seed: int) -> dict[str, Any]:
     """So many payloads of a seed, over all topics and ways; what came of them."""
-    rng, outcomes, wrong = random.Random(seed), Counter[str](), []
+    rng, outcomes = random.Random(seed), Counter[str]()
+    wrong: list[dict[str, str]] = []
     valid = {topic: encode(sample(topic.type)) for topic in TOPICS.values()}
     migrations = [Migration(number, Path("fuzz.mcap")) for number in range(OLDEST, FORMAT + 1)]
     start_s = time.monotonic()

@@ -76,7 +76,7 @@ def soak(seed: int, folder: Path, counts: Counter, rng: random.Random) -> None:
     counts["episodes"] += EPISODES
     counts["messages"] += report.messages
     counts["lost episodes"] += EPISODES - len(results)
-    counts["lost messages"] += sum(report.lost.values()) + len(report.absent) + (report.cut is not None)
+    counts["lost messages"] += sum(report.lost.values()) + report.count + (report.cut is not None)
     counts["messages said twice"] += report.repeated
     counts["runs with other actions"] += sorted(actions) != sorted(expected)
 

@@ -143,8 +143,8 @@ def _follow(folder: Path, processes: Sequence[Process], console: Console, worlds
         bus.subscribe((view, *SHOWN), lambda *item: arrived.put(item))
         # Not the router, which only the first world hears
         elsewhere = Elsewhere([process.name for process in processes[1:]], tell)
-        told = messages(arrived, bus, elsewhere, config.run or folder.name)
-        results = follow(told, elsewhere, processes, on_message)
+        told = messages(arrived, bus, elsewhere, config.run or folder.name, tell)
+        results = follow(told, elsewhere, processes, on_message, live=config.bus.live)
     for text in summary(config, results, progress):
         tell(text)
     tell(f"log: {Path(runs_folder().name) / folder.relative_to(runs_folder()) / LOG_NAME}")

@@ -3,7 +3,7 @@
     pip install eclipse-zenoh msgpack numpy
     python examples/listen.py tcp/127.0.0.1:PORT [COUNT]
 
-The address is `bus.endpoint` in the run's config.json. docs/reference/wire.md describes every key and field.
+The address is `bus.endpoint` in the run's config.json. docs/wire.md describes every key and field.
 """
 
 import json

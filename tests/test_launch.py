@@ -10,22 +10,25 @@ import subprocess
 import sys
 import time
 from collections import defaultdict
+from contextlib import closing, nullcontext
 
 import pytest
 
 from saccade.app.log.check import missing
 from saccade.app.run.launch import PROCESSES, launch, launched
-from saccade.app.run.supervisor import Process
+from saccade.app.run.supervisor import Process, Supervisor
 from saccade.shared.bus.messages import Status
-from saccade.shared.bus.topics import FRAME, RESULT, STATUS
+from saccade.shared.bus.topics import FRAME, GOAL, RESULT, STATUS
 from saccade.shared.bus.transport import ZenohBus, free_endpoint
+from saccade.shared.bus.wire import encode
 from saccade.shared.config import load
 from saccade.shared.errors import SaccadeError
-from saccade.shared.log.reading import RunReader
+from saccade.shared.log.reading import RunReader, is_whole
 from saccade.shared.loop.local import run_local
 from saccade.tests.fakes.launch import FAKES, PARTS, configuration, processes_of
 from saccade.tests.fakes.logs import so_far
 from saccade.tests.fakes.services import pairs
+from saccade.tests.samples import sample
 
 WAIT_S = 60
 
@@ -158,3 +161,69 @@ def test_an_interrupted_launcher_leaves_no_process_and_a_readable_log(tmp_path, 
         launcher.stdout.close()
         for left in processes_of(run_dir).values():
             os.kill(left, signal.SIGKILL)
+
+
+def test_a_run_that_cannot_go_on_says_why_and_ends(tmp_path, monkeypatch):
+    """Every service is alive, and each waits for another one."""
+    monkeypatch.setattr("saccade.app.run.halt.HALTED_S", 2.5)
+    with pytest.raises(SaccadeError, match=r"came to a halt: .*simulator waits for action of step 0 of episode 1"):
+        launch(configuration(3, 8, "planner is silent"), tmp_path / "run", None, FAKES)
+    assert processes_of(tmp_path / "run") == {}
+    assert not missing(tmp_path / "run" / "run.mcap").cut
+
+
+@pytest.mark.parametrize("forged", ["another run", "an episode to come", "a result of another run"])
+def test_whoever_is_not_of_this_run_is_named_and_never_stops_it_silently(tmp_path, monkeypatch, forged):
+    """A message of another run changes nothing; one that looks like this run's next episode may hold it up, and then
+    the run says so."""
+    monkeypatch.setattr("saccade.app.run.halt.HALTED_S", 2.5)
+    said: list[str] = []
+    config = configuration(3, 400).with_values({"bus.endpoint": free_endpoint("tcp/127.0.0.1:0")})
+    run, episode = ("run", 1) if forged == "an episode to come" else ("zz", 7)
+    forger = Forger(config.bus.endpoint)
+
+    def see(topic, part, message):
+        if topic == FRAME and (message.episode, message.step) == (0, 5):
+            forger.say(RESULT if "result" in forged else GOAL, run, episode)
+            forger.say(FRAME, run, episode)
+
+    with closing(forger), pytest.raises(SaccadeError) if run == "run" else nullcontext() as caught:
+        results = launch(config, tmp_path / "run", see, FAKES, said.append)
+    if run == "run":
+        assert str(caught.value).startswith("the run came to a halt: ")
+    else:
+        assert [result.episode for result in results] == [0, 1, 2]
+        assert any("of another run, 'zz', came on the bus" in text for text in said), said
+
+
+class Forger:
+    """Someone on the bus who says what others should."""
+
+    def __init__(self, endpoint: str) -> None:
+        self.endpoint, self.bus = endpoint, None
+
+    def say(self, topic, run: str, episode: int) -> None:
+        self.bus = self.bus or ZenohBus(self.endpoint, world="table")
+        message = sample(topic.type, run=run, episode=episode, step=0, seq=0)
+        self.bus.publish(topic, None, encode(message))
+
+    def close(self) -> None:
+        if self.bus is not None:
+            self.bus.close()
+
+
+def test_a_recorder_that_is_killed_at_the_very_end_is_told_and_its_log_gets_an_index(tmp_path, monkeypatch):
+    stop = Supervisor.stop
+
+    def killing(self, *, onlookers=True):
+        child = self._children.get("recorder")
+        if child is not None and child.poll() is None:
+            child.kill()
+            child.wait()
+        stop(self, onlookers=onlookers)
+
+    monkeypatch.setattr(Supervisor, "stop", killing)
+    with launched(configuration(2, 8), tmp_path / "run", None, FAKES) as ended:
+        assert len(ended.results) == 2
+        assert any("the recorder was killed before it had closed" in text for text in ended.lacks)
+    assert is_whole(tmp_path / "run" / "run.mcap")

@@ -159,3 +159,21 @@ def test_settled_arrays_are_aligned_frozen_and_no_ones_else():
     assert not np.shares_memory(settled.rgb, message.rgb)
     assert settle(settled) is settled
     assert encode(settled) == encode(message)
+
+
+def test_whoever_speaks_of_another_run_or_of_an_episode_after_the_next_is_refused():
+    judge = Service("judge", inputs=(TRUTH,), trigger=TRUTH, outputs=())
+    stepper = Stepper(judge, Keeper(), PARTS, run="r")
+
+    def offer(**stamp):
+        stepper.offer(TRUTH, None, sample(TRUTH.type, done=False, **stamp))
+
+    with pytest.raises(MessageError, match="run: 'zz', not this run 'r'"):
+        offer(run="zz", episode=0, step=0)
+    offer(run="r", episode=0, step=0)
+    assert stepper.advance() is not None
+    with pytest.raises(MessageError, match="episode: 2, while episode 0 goes on"):
+        offer(run="r", episode=2, step=0)
+    offer(run="r", episode=1, step=0)
+    assert stepper.advance() is not None
+    assert stepper.at == ("r", 1, 0)

@@ -248,7 +248,7 @@ def test_an_outline_goes_round_the_cells():
     ((GOLDEN, "--live"), "give the log of a run, or --live"),
     (("--live", "--save", "x.rrd"), "--save is for a log"),
     ((GOLDEN, "--run", "runs/x"), "--run and --endpoint are for a run that goes on"),
-    (("nowhere.mcap",), "nowhere.mcap cannot be read: No such file or directory"),
+    (("nowhere.mcap",), "nowhere.mcap cannot be read (No such file or directory): give the run.mcap of a run"),
     ((__file__,), "test_viewer.py is not an MCAP file"),
     (("--live", "--run", "nowhere"), "configuration nowhere/config.json cannot be read"),
     ((GOLDEN, "--save", GOLDEN), "is there already: name a new place")])

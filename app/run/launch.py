@@ -13,7 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
+from saccade.app.run.halt import Pulse
 from saccade.app.run.supervisor import Process, Supervisor
+from saccade.services.recorder.core import complete
 from saccade.services.simulator.objects import names_of
 from saccade.shared.bus.messages import Message, Result, Status
 from saccade.shared.bus.sequences import Sequences
@@ -23,6 +25,7 @@ from saccade.shared.bus.wire import MessageError, decode
 from saccade.shared.config import Config
 from saccade.shared.errors import LINE_LIMIT, SaccadeError, printable
 from saccade.shared.log.folder import CONFIG_NAME, LOG_NAME, LOGS_NAME
+from saccade.shared.log.reading import is_whole
 from saccade.shared.loop.main import READY_STATES
 from saccade.shared.loop.process import Item
 
@@ -30,15 +33,17 @@ Told = tuple[Topic, str | None, Message]
 OnMessage = Callable[[Topic, str | None, Message], None]
 FOLLOWED = (STATUS, PLAN, RESULT)  # these topics tell the launcher how far a run is
 READY_S = 120.0  # on a busy machine it takes long to load weights
+CONNECT_S = 10.0  # a router on this machine answers at once
 POLL_S = 0.2
+MOST_STRANGERS = 20  # other runs that are named
 # After so long without news the launcher asks for results: one may have been published while the router was away.
 QUIET_S = 2.0
 WORKED_OFF_S = 10.0  # If nobody judges: after so long without news the plan for the last frame will not come any more.
-JUDGE = "evaluator"
+JUDGE, RECORDER = "evaluator", "recorder"
 
 # The router, then the others in the order in which the data passes them.
 ROUTER, *SERVICES = PROCESSES = tuple(Process(name, f"saccade.services.{name}") for name in (
-    "router", "simulator", "perception", "belief", "planner", JUDGE, "recorder"))
+    "router", "simulator", "perception", "belief", "planner", JUDGE, RECORDER))
 
 
 def launch(config: Config, run_dir: Path, on_message: OnMessage | None = None,
@@ -51,11 +56,12 @@ def launch(config: Config, run_dir: Path, on_message: OnMessage | None = None,
 
 @dataclass(frozen=True)
 class Ended:
-    """A run that is over: its results, and `runs(name)`, which says whether the process of an onlooker is still
-    there."""
+    """A run that is over: its results; `runs(name)`, which says whether the process of an onlooker is still there; and
+    what did not end well, such as a log that lacks a part."""
 
     results: list[Result]
     runs: Callable[[str], bool]
+    lacks: tuple[str, ...] = ()
 
 
 @contextmanager
@@ -75,12 +81,17 @@ def launched(config: Config, run_dir: Path, on_message: OnMessage | None = None,
     config = resolve(config, processes)
     wanted = topics if on_message else ()
     with running(config, run_dir, processes, wanted if wanted is None else {*wanted, *FOLLOWED}, say) as graph:
-        results = follow(graph.messages, graph.supervisor, processes, on_message)
+        results = follow(graph.messages, graph.supervisor, processes, on_message, live=config.bus.live)
         graph.supervisor.stop(onlookers=False)
         _drain(graph.messages, on_message)
-        for complaint in graph.supervisor.complaints():  # such as a full disk
+        lacks = graph.supervisor.complaints()  # such as a full disk
+        if graph.supervisor.was_killed(RECORDER) and not is_whole(run_dir / LOG_NAME):
+            complete(run_dir, config)
+            lacks.append(f"the recorder was killed before it had closed {run_dir / LOG_NAME}: the log has its index "
+                         "now, and `saccade log check` says what it lacks")
+        for complaint in lacks:
             print(f"saccade: {printable(complaint, LINE_LIMIT)}", file=sys.stderr)
-        yield Ended(results, graph.supervisor.runs)
+        yield Ended(results, graph.supervisor.runs, tuple(lacks))
 
 
 class Watch(Protocol):
@@ -120,17 +131,31 @@ def running(config: Config, run_dir: Path, processes: Sequence[Process], topics:
     arrived: queue.SimpleQueue[Item] = queue.SimpleQueue()
     with ExitStack() as stack:
         stack.enter_context(_terminable())
-        supervisor = Supervisor(run_dir, say or (lambda text: print(f"saccade: {printable(text)}", file=sys.stderr)))
+        say = say or (lambda text: print(f"saccade: {printable(text)}", file=sys.stderr))
+        supervisor = Supervisor(run_dir, say)
         stack.callback(supervisor.stop)
         supervisor.start(processes[0])
-        bus = ZenohBus(config.bus.endpoint, world=config.bus.world)
+        bus = _connected(config, supervisor)
         stack.callback(bus.close)
         bus.subscribe(topics, lambda *item: arrived.put(item))
-        stream = messages(arrived, bus, supervisor, config.run or run_dir.name)
+        stream = messages(arrived, bus, supervisor, config.run or run_dir.name, say)
         _await_router(stream, processes[0])
         for process in processes[1:]:
             supervisor.start(process)
         yield Graph(bus, supervisor, stream)
+
+
+def _connected(config: Config, supervisor: Supervisor) -> ZenohBus:
+    """A client on the bus of a router that was just started. It is watched meanwhile: who died is started again. Raises
+    SaccadeError with the router's own reason if it cannot run, or if it does not answer within CONNECT_S."""
+    deadline_s = time.monotonic() + CONNECT_S
+    while True:
+        try:
+            return ZenohBus(config.bus.endpoint, world=config.bus.world, timeout_s=CONNECT_S / 5)
+        except SaccadeError:
+            supervisor.check()
+            if time.monotonic() > deadline_s:
+                raise
 
 
 def resolve(config: Config, processes: Sequence[Process] = PROCESSES) -> Config:
@@ -150,8 +175,11 @@ def _prepare(run_dir: Path) -> None:
         raise SaccadeError(f"run folder {run_dir} cannot be made: {error.strerror}") from error
 
 
-def messages(arrived: queue.SimpleQueue[Item], bus: Bus, watch: Watch, run: str) -> Iterator[Told | None]:
-    """Yields (topic, part, message) as they arrive, each once, and None when nothing arrived."""
+def messages(arrived: queue.SimpleQueue[Item], bus: Bus, watch: Watch, run: str,
+             say: Callable[[str], None]) -> Iterator[Told | None]:
+    """Yields (topic, part, message) as they arrive, each once, and None when nothing arrived. Messages of other runs
+    are ignored; `say` is told of each such run once."""
+    strangers: set[str] = set()
     sequences, looked_s, news_s = Sequences(), time.monotonic(), time.monotonic()
     while True:
         now_s = time.monotonic()
@@ -166,8 +194,14 @@ def messages(arrived: queue.SimpleQueue[Item], bus: Bus, watch: Watch, run: str)
         with suppress(queue.Empty, MessageError):  # a service that gets an invalid message counts it
             topic, part, payload = arrived.get(timeout=POLL_S)
             message = decode(topic.type, payload)
-            if isinstance(message, Status) and part is not None:
-                watch.heard(part, message.state)
+            if isinstance(message, Status):
+                if part is not None:
+                    watch.heard(part, message.state)
+            elif message.run != run:
+                if message.run not in strangers and len(strangers) < MOST_STRANGERS:
+                    strangers.add(message.run)
+                    say(f"a {topic.name} of another run, {message.run!r}, came on the bus: such messages are ignored")
+                continue
             if sequences.take(topic, part, message) is not None:
                 item = (topic, part, message)
                 news_s = news_s if topic == STATUS else now_s
@@ -184,10 +218,11 @@ def _await_router(messages: Iterator[Told | None], router: Process) -> None:
 
 
 def follow(told: Iterable[Told | None], watch: Watch, processes: Sequence[Process],
-           on_message: OnMessage | None) -> list[Result]:
+           on_message: OnMessage | None, *, live: bool) -> list[Result]:
     """Follows a run until it is over, and returns its results in the order of the episodes. Raises SaccadeError if a
-    service is not ready within READY_S."""
+    service is not ready within READY_S, or if all services wait for one another; `live`, they may wait for a camera."""
     starting = {process.name for process in processes[1:] if not process.onlooker}
+    pulse = Pulse(set() if live else set(starting))
     course = _Course(processes[1].name, judged=JUDGE in starting)
     over_s, deadline_s = None, time.monotonic() + READY_S
     for item in told:
@@ -196,12 +231,15 @@ def follow(told: Iterable[Told | None], watch: Watch, processes: Sequence[Proces
         over_s = (over_s or time.monotonic()) if course.over else None
         if over_s is not None and watch.settled(over_s):
             break
+        if over_s is None and (why := pulse.halted()):
+            raise SaccadeError(why)
         if item is None:
             continue
         topic, part, message = item
         if on_message is not None:
             on_message(topic, part, message)
         course.take(topic, part, message)
+        pulse.take(topic, part, message)
         if isinstance(message, Status) and part is not None and message.state in READY_STATES:
             starting.discard(part)
     return [course.results[episode] for episode in sorted(course.results)]

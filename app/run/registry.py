@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
 
-from saccade.app.run.launch import JUDGE
+from saccade.app.run.launch import JUDGE, RECORDER
 from saccade.app.run.supervisor import VIEWER, Process
 from saccade.app.run.threads import limit_torch
 from saccade.shared.bus.topics import TRUTH
@@ -18,7 +18,7 @@ from saccade.shared.loop.service import Core, Service
 
 Pair = tuple[Service, Core]
 
-ROUTER, RECORDER = "router", "recorder"
+ROUTER = "router"
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,7 @@ MANIFEST_NAME = "manifest.json"
 @dataclass(frozen=True)
 class Finished:
     """A run that is over: its resolved configuration, its folder, how its episodes ended, whether its viewer still
-    shows it, and why its log lacks a part, if it was written by this process and lacks one."""
+    shows it, and what did not end well, such as a log that lacks a part."""
 
     config: Config
     folder: Path
@@ -77,6 +77,7 @@ def run(config: Config, *, agent: str, out: Path | None, plain: bool, console: C
                     ended = stack.enter_context(
                         launched(config, folder, display.take, processes, display.say, display.topics))
                     results = ended.results
+                    lacks += ended.lacks
                 else:
                     results = run_here(config, agent, folder, display, world, lacks)
             except KeyboardInterrupt:

@@ -137,9 +137,13 @@ class Supervisor:
         return name in self._children and self._children[name].poll() is None
 
     def complaints(self) -> list[str]:
-        """For each stopped service that did not end well: its name, and what it said last."""
+        """For each stopped service that did not end well, onlookers aside: its name, and what it said last."""
         return [f"{name}: {self._last_line(name, child.returncode)}"
-                for name, child in self._children.items() if child.returncode]
+                for name, child in self._children.items() if child.returncode and not self._processes[name].onlooker]
+
+    def was_killed(self, name: str) -> bool:
+        """Whether a stopped service was ended by a signal, before it could end by itself."""
+        return name in self._children and (self._children[name].returncode or 0) < 0
 
     def log_path(self, name: str) -> Path:
         """The file that holds what a service prints."""
@@ -151,6 +155,9 @@ class Supervisor:
             past.popleft()
         if code == EXIT_ERROR or len(past) >= RESTARTS:
             died = "" if code == EXIT_ERROR else f"; it has died {len(past) + 1} times in {RESTARTS_S:.0f} s"
+            router = next(iter(self._processes))
+            if code == EXIT_ERROR and self._restarts.get(router):  # without it nobody can work
+                reason = f"{reason}; the {router} has died {len(self._restarts[router])} times"
             if not self._processes[name].onlooker:
                 raise SaccadeError(f"{name}: {reason}{died}")
             self._say(f"the run goes on without the {name}: {reason}{died}")

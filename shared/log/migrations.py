@@ -14,6 +14,7 @@ import msgpack
 
 from saccade.shared.bus import messages as m
 from saccade.shared.bus.topics import Topic
+from saccade.shared.bus.wire import scan
 from saccade.shared.errors import SaccadeError
 
 Fields = dict[str, Any]
@@ -63,6 +64,7 @@ class Migration:
         if not self._changes:
             return payload
         try:
+            scan(payload)
             fields = msgpack.unpackb(payload)
             for change in self._changes:
                 fields = change(topic, part, fields)

@@ -97,7 +97,7 @@ class RunReader:
         if isinstance(record, Attachment) and record.name == CONFIGURATION:
             if len(record.data) > MAX_CONFIGURATION_BYTES:
                 raise ValueError("the configuration is too large")
-            self.configuration = record.data.decode()
+            self.configuration = record.data.decode(errors="replace")  # whoever reads it refuses it
         elif isinstance(record, Metadata) and record.name != KEY:
             if len(self.metadata) >= MOST_NOTES and record.name not in self.metadata:
                 raise ValueError("there is too much metadata")

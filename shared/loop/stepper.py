@@ -120,9 +120,12 @@ class Stepper:
 
     def waits_for(self) -> list[str]:
         """What the next step lacks, as texts such as 'percept/mug of step 3'; empty if nothing is open."""
-        if not self._slots:
+        if self._slots:
+            at = min(self._slots, key=lambda a: a[1:])
+        elif self._begun is not None and self._source and not (self.timed or self.episode_done):
+            at = (*self._begun, self._last_step)
+        else:
             return []
-        at = min(self._slots, key=lambda a: a[1:])
         if not self._live and not self._source:
             due = self._last_step + 1 if self._begun == at[:2] else self._first_step
             at = (*at[:2], min(at[2], due))

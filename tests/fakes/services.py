@@ -109,10 +109,11 @@ class FakeBelief:
 
 
 class FakePlanner:
-    """A bounded move away from the sums. In episode `dies_in` it kills itself, for tests of what then happens."""
+    """A bounded move away from the sums. In episode `dies_in` it kills itself, in `silent_in` it says nothing, for
+    tests of what then happens."""
 
-    def __init__(self, dies_in: int | None = None, breaks_in: int | None = None) -> None:
-        self.dies_in, self.breaks_in = dies_in, breaks_in
+    def __init__(self, dies_in: int | None = None, breaks_in: int | None = None, silent_in: int | None = None) -> None:
+        self.dies_in, self.breaks_in, self.silent_in = dies_in, breaks_in, silent_in
 
     def begin(self, run: str, episode: int) -> Iterable[Output]:
         if episode == self.breaks_in:
@@ -123,6 +124,8 @@ class FakePlanner:
 
     def step(self, inputs: Inputs) -> Iterable[Output]:
         beliefs = list(inputs["belief"].values())
+        if beliefs[0].episode == self.silent_in:
+            return
         at = {"run": beliefs[0].run, "episode": beliefs[0].episode, "step": beliefs[0].step}
         move = np.tanh(sum(b.mean_m for b in beliefs) / 1e4 + beliefs[0].particles_m.sum() / 1e9) / 4
         yield Output(PLAN, Plan(**at, target="mug", mode="seek", viewpoint=IDENTITY, look_at_m=move, g_position=1.0,
@@ -155,7 +158,8 @@ def build(name: str, config: Config):
         "simulator": lambda: FakeSimulator(config.seed, config.scene.count, config.simulator.max_steps),
         "perception": lambda: FakePerception(names),
         "belief": lambda: FakeBelief(names),
-        "planner": lambda: FakePlanner(1 if wish == "planner dies" else None, 1 if wish == "planner breaks" else None),
+        "planner": lambda: FakePlanner(*(1 if wish == f"planner {what}" else None
+                                         for what in ("dies", "breaks", "is silent"))),
         "evaluator": FakeEvaluator,
     }[name]()
 
