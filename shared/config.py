@@ -252,9 +252,10 @@ class Config(Section):
             for parent in parents:
                 node = node.get(parent) if isinstance(node, dict) else None
             if not isinstance(node, dict) or last not in node:
-                raise SaccadeError(f"configuration key {told(dotted)} is unknown: see shared/config.py")
+                raise SaccadeError(f"configuration key {told(dotted)} is unknown: the guide "
+                                   "(docs/reference/configuration.md) lists all keys")
             node[last] = str(value) if isinstance(value, Path) else value
-        return validate(tree, "command line")
+        return validate(tree, "the given values")
 
     def save(self, path: Path) -> None:
         """Writes the resolved configuration as JSON, which `load` reads back: whole or not at all. Raises SaccadeError

@@ -47,7 +47,8 @@ class ActiveSearch(gymnasium.Env[Observation, NDArray[np.float64]]):
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 - Gymnasium's interface
 
     def __init__(self, *, objects: Literal["pantry", "ycb"] = "pantry", names: Sequence[str] | None = None,
-                 n_objects: int | None = None, yaw: Literal["random", "fixed"] = "random", scenes: Path | None = None,
+                 n_objects: int | None = None, yaw: Literal["random", "fixed"] = "random",
+                 scenes: str | Path | None = None,
                  max_steps: int = MAX_STEPS, render_mode: str | None = None):
         image = spaces.Box(0, 255, (IMAGE_SIZE_PX, IMAGE_SIZE_PX, 3), np.uint8)
         self.observation_space = spaces.Dict(
@@ -56,7 +57,7 @@ class ActiveSearch(gymnasium.Env[Observation, NDArray[np.float64]]):
         self.render_mode, self.yaw, self.n_objects, self.max_steps = render_mode, yaw, n_objects, max_steps
         in_use = names_in_use(SceneConfig(objects=objects, names=tuple(names) if names is not None else None))
         self._world = World(tuple(load_mesh(objects, name) for name in in_use))
-        self._file = {scene.id: scene for scene in load_scenes(scenes, in_use)} if scenes is not None else {}
+        self._file = {scene.id: scene for scene in load_scenes(Path(scenes), in_use)} if scenes is not None else {}
         self._simulator: Simulator | None = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict]:
