@@ -233,16 +233,6 @@ def test_what_holds_for_the_episode_is_kept_however_much_comes_after_it():
     assert outbox.answer((GOAL, FRAME), ("r", 0, 0), 1000)[0].at == ("r", 1, 0)
 
 
-def test_of_past_episodes_little_is_kept_and_of_this_one_all():
-    outbox = Outbox(limit_bytes=1000, past_bytes=300)
-    for episode in range(3):
-        for step in range(4):
-            outbox.keep(FRAME, None, sample(FRAME.type, run="r", episode=episode, step=step), bytes(100))
-    assert [k.at[1:] for k in outbox.answer((FRAME,), ("r", 0, 0), 9999)] == [(2, step) for step in range(4)]
-    outbox.keep(FRAME, None, sample(FRAME.type, run="r", episode=3, step=0), bytes(100))
-    assert [k.at[1:] for k in outbox.answer((FRAME,), ("r", 0, 0), 9999)] == [(2, 2), (2, 3), (3, 0)]
-
-
 def test_an_action_that_comes_late_is_no_news_for_a_source_that_goes_by_time():
     source = Stepper(TIMED, FakeCamera(3, 1.0), PARTS, source=True, live=True)
     source.begin("r", 0)

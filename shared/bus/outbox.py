@@ -15,7 +15,6 @@ from saccade.shared.bus.wire import Stamp
 Since = tuple[str, int, int]  # run, episode, step
 
 KEPT_BYTES = 384 * 1024 * 1024  # more than the frames of the longest episode
-PAST_BYTES = 96 * 1024 * 1024  # while what is kept is larger, episodes before the newest one are dropped
 PAGE_BYTES = 32 * 1024 * 1024  # of one answer
 
 
@@ -30,11 +29,11 @@ class Kept(NamedTuple):
 
 
 class Outbox:
-    """Keeps the newest `limit_bytes` of what was published, and what holds for the whole of the newest episode; of the
-    episodes before it only as much as makes `past_bytes` in all. Safe between threads."""
+    """Keeps the newest `limit_bytes` of what was published, and what holds for the whole of the newest episode. Safe
+    between threads."""
 
-    def __init__(self, limit_bytes: int = KEPT_BYTES, past_bytes: int = PAST_BYTES) -> None:
-        self._limit, self._past, self._held = limit_bytes, min(past_bytes, limit_bytes), 0
+    def __init__(self, limit_bytes: int = KEPT_BYTES) -> None:
+        self._limit, self._held = limit_bytes, 0
         self._kept: deque[Kept] = deque()
         self._lock = threading.Lock()
 
@@ -45,7 +44,7 @@ class Outbox:
             self._kept.append(kept)
             self._held += len(payload)
             holding = []
-            while self._kept and self._held > (self._limit if self._kept[0].at[:2] == kept.at[:2] else self._past):
+            while self._held > self._limit and self._kept:
                 old = self._kept.popleft()
                 if old.topic.latched and old.at[:2] == kept.at[:2]:
                     holding.append(old)
