@@ -1,4 +1,5 @@
-"""The messages: frozen dataclasses whose annotations tell all of their fields; `shared/bus/wire.py` encodes them."""
+"""The messages. Each one is a frozen dataclass, and its annotations define all of its fields. `shared/bus/wire.py`
+encodes them."""
 
 from __future__ import annotations
 
@@ -13,20 +14,21 @@ import numpy as np
 
 @dataclass(frozen=True)
 class ArraySpec:
-    """dtype and shape of an array field; a str in the shape is a free dimension, equal wherever it is named."""
+    """dtype and shape of an array field. A name in the shape stands for any length; it is the same length wherever the
+    name occurs in a message."""
 
     dtype: str
     shape: tuple[int | str, ...]
 
 
 def array(dtype: str, *shape: int | str) -> ArraySpec:
-    """What an array field holds, for its annotation: `Annotated[np.ndarray, array("f4", "N", 3)]`."""
+    """Describes an array field in its annotation: `Annotated[np.ndarray, array("f4", "N", 3)]`."""
     return ArraySpec(dtype, shape)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Message(metaclass=type):  # noqa: UP050 - without it mypy holds that its classes cannot be keys of a cache
-    """What every message carries."""
+class Message(metaclass=type):  # noqa: UP050 - without it mypy says that its classes cannot be keys of a cache
+    """The fields that every message carries."""
 
     VERSION: ClassVar[int] = 1
 
@@ -100,7 +102,7 @@ class Percept(Message):
     """Whether the object is seen in each of MxM cells of the image: a row of cells packed into bytes."""
 
     def mask(self) -> np.ndarray | None:
-        """Where in the image the object is seen: truth values [M, M]."""
+        """Where in the image the object is seen: truth values [M, M]. None if the message has no mask."""
         if self.mask_bits is None:
             return None
         return np.unpackbits(self.mask_bits, axis=1)[:, :len(self.mask_bits)].astype(bool)
@@ -285,6 +287,6 @@ class Status(Message):
 
 @functools.cache
 def field_types(message_type: type[Message]) -> dict[str, Any]:
-    """Field names and their annotations, in order."""
+    """Names and annotations of a message's fields, in their order."""
     hints = typing.get_type_hints(message_type, include_extras=True)
     return {f.name: hints[f.name] for f in dataclasses.fields(message_type)}

@@ -1,4 +1,5 @@
-"""What a service has published lately, for whoever missed it: started again, late, or cut off for a while."""
+"""Keeps what a service has published lately, for services that were started again, came late, or were cut off for a
+while."""
 
 from __future__ import annotations
 
@@ -15,11 +16,11 @@ from saccade.shared.bus.wire import Stamp
 Since = tuple[str, int, int]  # run, episode, step
 
 KEPT_BYTES = 384 * 1024 * 1024  # more than the frames of the longest episode
-PAGE_BYTES = 32 * 1024 * 1024  # of one answer
+PAGE_BYTES = 32 * 1024 * 1024  # about the size of one answer
 
 
 class Kept(NamedTuple):
-    """A message as it was published, and when."""
+    """A message as it was published, with the time of publication."""
 
     topic: Topic
     part: str | None
@@ -29,8 +30,8 @@ class Kept(NamedTuple):
 
 
 class Outbox:
-    """Keeps the newest `limit_bytes` of what was published, and what holds for the whole of the newest episode. Safe
-    between threads."""
+    """Keeps the newest `limit_bytes` of what was published, and all latched messages of the newest episode. It may be
+    used by several threads."""
 
     def __init__(self, limit_bytes: int = KEPT_BYTES) -> None:
         self._limit, self._held = limit_bytes, 0
@@ -38,7 +39,8 @@ class Outbox:
         self._lock = threading.Lock()
 
     def keep(self, topic: Topic, part: str | None, message: Message | Stamp, payload: bytes) -> None:
-        """To be called before the message is published: what a reader misses it can then ask for."""
+        """Keeps a message. It must be called before the message is published, so that a reader that misses the message
+        can ask for it."""
         kept = Kept(topic, part, payload, (message.run, message.episode, message.step), time.time_ns())
         with self._lock:
             self._kept.append(kept)
@@ -53,8 +55,12 @@ class Outbox:
             self._kept.extendleft(reversed(holding))
 
     def answer(self, topics: Iterable[Topic], since: Since | None, limit_bytes: int) -> list[Kept]:
-        """What was published on these topics in the run of `since` from its episode and step on, oldest first, whole
-        steps of about `limit_bytes` in all. Without `since`: from the start of the newest episode."""
+        """Returns what was published on these topics in the run of `since` (run, episode, step), from that step on,
+        oldest first.
+
+        The answer consists of whole steps, and of about `limit_bytes` in all. Without `since` it begins at the start of
+        the newest episode.
+        """
         names = {topic.name for topic in topics}
         with self._lock:
             chosen = [kept for kept in self._kept if kept.topic.name in names]

@@ -1,4 +1,5 @@
-"""Sequence numbers: per key, from 0 in every episode, so that a service that was started again gives the same ones."""
+"""Sequence numbers. Each key counts from 0 in every episode, so a service that was started again gives the same
+numbers."""
 
 from __future__ import annotations
 
@@ -14,15 +15,18 @@ Episode = tuple[str, int]  # run and number
 
 
 class Stamper:
-    """Numbers the messages of an episode per key, in the order in which they are made. With `first_step`, by their
-    step: of each key there is one a step, or one an episode where it is latched, whoever makes it."""
+    """Numbers the messages of an episode for each key, in the order in which they are made.
+
+    With `first_step` the number follows from the step of the message instead. It is then the same whichever copy of a
+    service makes the message: a key has one message per step, or one per episode if its topic is latched.
+    """
 
     def __init__(self, first_step: int | None = None) -> None:
         self._next: dict[tuple[str, str | None], int] = {}
         self._first_step = first_step
 
     def stamp(self, output: Output) -> Output:
-        """The output with its sequence number."""
+        """Returns the output with its sequence number."""
         key = (output.topic.name, output.part)
         seq = self._next.get(key, 0)
         if self._first_step is not None:
@@ -32,24 +36,29 @@ class Stamper:
 
 
 class Missing:
-    """Which numbers of one key in one episode have not come, as ranges: memory grows with what came, not with what a
-    number claims."""
+    """The sequence numbers of one key in one episode that have not arrived.
+
+    They are kept as ranges. So memory grows with the number of messages that arrived, not with the numbers that they
+    claim.
+    """
 
     def __init__(self) -> None:
         self._ranges: list[tuple[int, int]] = []  # [first, end) in rising order, apart from one another
         self.count = 0
 
     def add(self, first: int, end: int) -> None:
-        """Numbers beyond all that are known."""
+        """Adds the numbers from `first` up to `end`, without `end`. They must be higher than all numbers that are
+        known."""
         self._ranges.append((first, end))
         self.count += end - first
 
     def give_up(self) -> None:
-        """Numbers are counted anew: those that are missing still count, and will not come."""
+        """Forgets which numbers are missing, because the publisher counts anew. They still count, and they will not
+        arrive."""
         self._ranges = []
 
     def remove(self, number: int) -> bool:
-        """Whether the number was missing; it is no longer."""
+        """Removes a number from the missing ones. Returns whether it was missing."""
         at = bisect_right(self._ranges, number, key=lambda known: known[0]) - 1
         if at < 0 or number >= self._ranges[at][1]:
             return False
@@ -60,22 +69,24 @@ class Missing:
 
 
 class Sequences:
-    """Which messages of each key were there. What is missing may still come, out of its turn.
+    """Remembers which messages of each key have arrived. A message that is missing may still arrive later, out of
+    order.
 
-    A status is not part of an episode: it counts from 0 in every process, and nobody can ask for it again. Where nobody
-    waits, a service that was started again goes on with the newest step and counts anew: a number that was there
-    already, of a step that was not.
+    A status does not belong to an episode: it counts from 0 in every process, and nobody can ask for it again. In live
+    mode, a service that was started again continues with the newest step and counts anew. This is noticed when a
+    sequence number that was already used comes with a later step.
     """
 
     def __init__(self, *, from_start: bool = False, cut: bool = False) -> None:
-        self._from_start = from_start  # whether this listens since before the first message
+        self._from_start = from_start  # whether it has listened since before the first message
         self._cut = cut  # whether every episode may begin at any number
         self._next: dict[Key, dict[Episode, int]] = {}
         self._last_step: dict[tuple[Key, Episode], int] = {}
         self._missing: dict[Key, dict[Episode, Missing]] = {}
 
     def take(self, topic: Topic, part: str | None, message: Message | Stamp) -> int | None:
-        """How many messages of this key are missing just before this one; None for one that was there already."""
+        """Takes a message. Returns how many messages of its key are missing directly before it, or None if it has
+        arrived before."""
         key, episode, seq = (topic.name, part), (message.run, message.episode), message.seq
         if not topic.in_step:
             known = self._next.get(key, {}).get(("", 0), seq)
@@ -99,21 +110,22 @@ class Sequences:
 
     @property
     def missing(self) -> dict[Key, int]:
-        """How many messages of each key have not come."""
+        """How many messages of each key have not arrived. Keys that lack nothing are left out."""
         counts = {key: sum(missing.count for missing in episodes.values()) for key, episodes in self._missing.items()}
         return {key: count for key, count in counts.items() if count}
 
     @property
     def first_missing(self) -> int:
-        """The first episode of which something has not come; 0 where all has."""
+        """The first episode in which a message is missing. It is 0 if nothing is missing."""
         return min((episode for episodes in self._missing.values() for (_, episode), missing in episodes.items()
                     if missing.count), default=0)
 
     def has_begun(self, key: Key, run: str, episode: int) -> bool:
-        """Whether any message of this key in that episode was there."""
+        """Whether any message of this key in that episode has arrived."""
         return (run, episode) in self._next.get(key, {})
 
     def begins(self, topic: Topic, part: str | None, message: Message | Stamp) -> bool:
-        """Whether this is the first message of its key in a later episode than those before it."""
+        """Whether this message is the first of its key in its episode, while other episodes of the key have begun
+        before."""
         key = topic.name, part
         return topic.in_step and key in self._next and not self.has_begun(key, message.run, message.episode)

@@ -1,4 +1,4 @@
-"""How a Zenoh session is opened. Every endpoint is named: nothing is scouted."""
+"""Opens Zenoh sessions. Every endpoint is given by its address: Saccade never searches the network for others."""
 
 from __future__ import annotations
 
@@ -15,19 +15,23 @@ from saccade.shared.bus.topics import ROOT
 from saccade.shared.bus.wire import MAX_BYTES
 from saccade.shared.errors import SaccadeError
 
-CONFIG_VARIABLE = "ZENOH_CONFIG"  # a file of Zenoh's settings to begin with: certificates, passwords, access
-# Publishers wait for whoever is slow: in lockstep a lost message would stop the world. Who only looks on is known to
-# the router by its session's id, one of these, and gets what fits into its queue: the rest is dropped, nobody waits.
-# They are drawn at random and so many that two hardly ever draw the same; the second would be refused.
+CONFIG_VARIABLE = "ZENOH_CONFIG"  # names a file of Zenoh's settings to begin with: certificates, passwords, access
+# Publishers wait for slow readers, because in lockstep a lost message would stop the run. Onlookers are the exception.
+# The router knows them by the id of their session, which is one of these ids. It gives an onlooker what fits into its
+# queue and drops the rest, so nobody waits. Each onlooker draws its id at random. The router would refuse a second
+# session with the same id, so there are many ids, and two onlookers hardly ever draw the same one.
 ONLOOKERS = tuple(f"{0x5accade0000 + k:x}" for k in range(1 << 14))
-QUEUE_BATCHES = 16  # of 64 KiB: a camera image fits in whole
+QUEUE_BATCHES = 16  # batches of 64 KiB; a whole camera image fits into so many
 DROP_FOR_ONLOOKERS = {"id": "onlookers", "zids": ONLOOKERS, "messages": ["put"], "key_exprs": [f"{ROOT}/**"],
                       "flows": ["egress"], "overwrite": {"congestion_control": "drop"}}
 
 
 def open_session(endpoint: str, *, listen: bool, onlooker: bool, timeout_s: float) -> zenoh.Session:
-    """The router's session (`listen`), or a client's of the router at the endpoint. Raises SaccadeError if the endpoint
-    is in use (listen), malformed, or does not answer in time."""
+    """Opens the router's session (`listen`), or the session of a client of the router at `endpoint`.
+
+    Raises SaccadeError if the endpoint is in use (`listen`) or malformed, if the router does not answer within
+    `timeout_s` seconds or refuses this client, or if the file of Zenoh's settings cannot be used.
+    """
     file = os.environ.get(CONFIG_VARIABLE)
     try:
         config = zenoh.Config.from_file(file) if file else zenoh.Config()
@@ -72,7 +76,7 @@ def _explain(endpoint: str, listen: bool, timeout_s: float, error: str) -> str:
 
 
 def _is_open(endpoint: str) -> bool:
-    """Whether something listens there."""
+    """Whether something listens at the endpoint."""
     match = re.fullmatch(r"\w+/(\[[0-9a-fA-F:]+\]|[^\[\]:]+):(\d+)", endpoint)
     if match is None:
         return False

@@ -1,4 +1,4 @@
-"""The registry: every topic, its key, its message type, who may be late for it. No key stands anywhere else."""
+"""The registry of all topics, with the key and the message type of each. Keys are defined nowhere else."""
 
 from __future__ import annotations
 
@@ -16,8 +16,12 @@ Of = TypeVar("Of", bound=m.Message, covariant=True)
 
 @dataclass(frozen=True)
 class Topic(Generic[Of]):
-    """One kind of publication. `parts`: one key per object (or service) below the topic's. `latched`: one value an
-    episode, kept for every later step. `in_step`: published once per step (and part), so that gaps can be told."""
+    """One kind of publication.
+
+    `parts`: the topic has one key for each object, or for each service in the case of `status`. `latched`: it has one
+    message per episode, which holds for every later step. `in_step`: it is published once per step (and part), so that
+    a gap can be noticed.
+    """
 
     name: str
     type: type[Of]
@@ -26,13 +30,14 @@ class Topic(Generic[Of]):
     in_step: bool = True
 
     def key(self, world: str, part: str | None = None) -> str:
-        """The key expression `saccade/<world>/<topic>[/<part>]`; without `part`, of all parts."""
+        """Returns the key `saccade/<world>/<topic>`, with `/<part>` if the topic has parts. Without `part` it is the
+        key expression of all parts."""
         return f"{ROOT}/{world}/{self.name}" + (f"/{part or '*'}" if self.parts else "")
 
 
 @dataclass(frozen=True)
 class Output:
-    """A message on its way out; `part` names the object where the topic has parts."""
+    """A message that will be published. `part` names the object if the topic has parts."""
 
     topic: Topic
     message: m.Message
@@ -55,7 +60,7 @@ TOPICS: dict[str, Topic] = {topic.name: topic for topic in (
 
 
 def parse_key(key: str) -> tuple[str, Topic, str | None]:
-    """(world, topic, part) of a key. Raises SaccadeError for a key that is none of ours."""
+    """Returns (world, topic, part) of a key. Raises SaccadeError if it is not a key of Saccade's."""
     match = re.fullmatch(rf"{ROOT}/([^/*]+)/([^/*]+)(?:/([^/*]+))?", key)
     topic = TOPICS.get(match[2]) if match else None
     if match is None or topic is None or topic.parts != (match[3] is not None):

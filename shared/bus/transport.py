@@ -1,6 +1,8 @@
-"""The bus: bytes in, bytes out, by topic and part. Zenoh between processes, and a twin within one.
+"""The bus, which carries encoded messages by topic and part. `ZenohBus` connects processes; `LocalBus` works within one
+process.
 
-Every endpoint is named: nothing is scouted, and nothing listens beyond the address given.
+Every endpoint is given by its address. The bus never searches the network for others, and it listens only at the given
+address.
 """
 
 from __future__ import annotations
@@ -24,41 +26,50 @@ from saccade.shared.errors import SaccadeError
 if TYPE_CHECKING:
     import zenoh
 
-Deliver = Callable[[Topic, str | None, bytes], None]  # runs on the bus's thread: must only put its arguments somewhere
+Deliver = Callable[[Topic, str | None, bytes], None]  # runs on the bus's thread, so it may only store its arguments
 Answer = Callable[[Iterable[Topic], Since | None, int], list[Kept]]
 Met = Callable[[frozenset[str]], None]
 
 ROUTER_WAIT_VARIABLE, ROUTER_S = "SACCADE_ROUTER_S", 10.0
-RECALL_S = 3.0  # for an answer to be whole: a publisher that hangs must not hang who asks it
+RECALL_S = 3.0  # a whole answer must come within this time, so that a publisher that hangs does not block others
 
 
 class Bus(Protocol):
-    """Messages of one key arrive in the order in which they were published. What was lost on the way, while a process
-    or the router was away, its publisher still knows: `recall`."""
+    """Carries encoded messages between services. Messages of one key arrive in the order in which they were published.
+
+    A message can be lost while a process or the router is away. Its publisher still keeps it for a while, and `recall`
+    asks for it.
+    """
 
     def publish(self, topic: Topic, part: str | None, payload: bytes) -> None:
-        """Sends wire bytes to whoever subscribes."""
+        """Sends an encoded message to all subscribers."""
 
     def subscribe(self, topics: Iterable[Topic] | None, deliver: Deliver) -> None:
-        """Calls `deliver(topic, part, payload)` for every message of these topics, or of all."""
+        """Calls `deliver(topic, part, payload)` for every message of these topics, or of all topics if `topics` is
+        None."""
 
     def answer(self, topics: Iterable[Topic], answer: Answer) -> None:
-        """Lets `answer(topics, since, limit_bytes)` tell others what was published on these topics."""
+        """Calls `answer(topics, since, limit_bytes)` when others ask what was published on these topics, and sends them
+        the result."""
 
     def recall(self, topics: Iterable[Topic], since: Since | None = None, limit_bytes: int = PAGE_BYTES) -> list[Kept]:
-        """What the publishers of these topics keep from (run, episode, step) on, or of their newest episode: each
-        one's messages in their order, at most about `limit_bytes` of each. Empty where nobody answers."""
+        """Asks the publishers of these topics for the messages that they keep, and returns them.
+
+        With `since` (run, episode, step) these are the messages from this step on, without it those of each publisher's
+        newest episode. The messages of one publisher are in their order, and take at most about `limit_bytes`. The list
+        is empty if nobody answers.
+        """
 
     def join(self, group: str, member: str, met: Met) -> None:
-        """Is a member of a group until `close`; calls `met(members)` at once and whenever one comes or goes, be it
-        killed."""
+        """Joins a group until `close`. Calls `met(members)` at once, and again whenever a member comes or goes, even if
+        it was killed."""
 
     def close(self) -> None:
-        """Leaves the bus. May be called twice."""
+        """Leaves the bus. It may be called twice."""
 
 
 class LocalBus:
-    """The twin within one process: `publish` returns when every subscriber has its bytes."""
+    """The bus within one process. `publish` returns when every subscriber has the bytes."""
 
     def __init__(self) -> None:
         self._subscribers: list[tuple[frozenset[str] | None, Deliver]] = []
@@ -66,36 +77,36 @@ class LocalBus:
         self._groups: dict[str, dict[str, Met]] = {}
 
     def publish(self, topic: Topic, part: str | None, payload: bytes) -> None:
-        """Delivers at once, on the caller's thread."""
+        """Delivers at once, on the thread of the caller."""
         for names, deliver in list(self._subscribers):
             if names is None or topic.name in names:
                 deliver(topic, part, payload)
 
     def subscribe(self, topics: Iterable[Topic] | None, deliver: Deliver) -> None:
-        """From now on; nothing published before is repeated."""
+        """Subscribes from now on. Messages that were published before are not repeated."""
         self._subscribers.append((None if topics is None else frozenset(t.name for t in topics), deliver))
 
     def answer(self, topics: Iterable[Topic], answer: Answer) -> None:
-        """From now on."""
+        """Answers questions from now on."""
         self._answers.append((frozenset(t.name for t in topics), answer))
 
     def recall(self, topics: Iterable[Topic], since: Since | None = None, limit_bytes: int = PAGE_BYTES) -> list[Kept]:
-        """Asks at once, on the caller's thread."""
+        """Asks at once, on the thread of the caller."""
         topics = tuple(topics)
         return [kept for names, answer in list(self._answers)
                 if (asked := [t for t in topics if t.name in names]) for kept in answer(asked, since, limit_bytes)]
 
     def join(self, group: str, member: str, met: Met) -> None:
-        """Tells everyone, on the caller's thread."""
+        """Joins the group and tells all its members, on the thread of the caller."""
         self._groups.setdefault(group, {})[member] = met
         self._tell(group)
 
     def members(self, group: str) -> frozenset[str]:
-        """Who is in a group now."""
+        """The present members of a group."""
         return frozenset(self._groups.get(group, ()))
 
     def leave(self, group: str, member: str) -> None:
-        """What the end of a process does on a real bus."""
+        """Removes a member from a group. On a real bus this happens when its process ends."""
         del self._groups[group][member]
         self._tell(group)
 
@@ -105,23 +116,24 @@ class LocalBus:
             met(frozenset(members))
 
     def close(self) -> None:
-        """Forgets the subscribers."""
+        """Forgets all subscribers and answers."""
         self._subscribers.clear()
         self._answers.clear()
 
 
 class ZenohBus:
-    """One Zenoh session in one world: the router's own (`listen`), or a client of the router at `endpoint`.
+    """One Zenoh session in one world. With `listen` it is the router's session, otherwise a client of the router at
+    `endpoint`.
 
-    Raises SaccadeError if the endpoint is in use (listen), malformed, or does not answer within `timeout_s` seconds,
-    which are 10 unless SACCADE_ROUTER_S says otherwise.
-    A router that goes away later is found again when it comes back. For an `onlooker` nobody waits: what it is too slow
-    for it misses.
+    If the router goes away, the client finds it again when it comes back. Nobody waits for an `onlooker`: it misses the
+    messages for which it is too slow. Raises SaccadeError if the endpoint is in use (`listen`) or malformed, if a
+    client is given port 0, or if the router does not answer within `timeout_s` seconds. The default is 10 seconds, or
+    the value of SACCADE_ROUTER_S.
     """
 
     def __init__(self, endpoint: str, *, world: str, listen: bool = False, onlooker: bool = False,
                  timeout_s: float | None = None) -> None:
-        import zenoh  # here, so that in-process runs do without it
+        import zenoh  # here, so that a run within one process does not need it
 
         from saccade.shared.bus.session import open_session
 
@@ -141,7 +153,8 @@ class ZenohBus:
         self._session = open_session(endpoint, listen=listen, onlooker=onlooker, timeout_s=timeout_s)
 
     def publish(self, topic: Topic, part: str | None, payload: bytes) -> None:
-        """Blocks while the network is congested: in lockstep a lost message would stop the world."""
+        """Sends an encoded message. It blocks while the network is congested, because in lockstep a lost message would
+        stop the run. Raises ValueError if the topic has parts and `part` is missing."""
         if topic.parts and not part:
             raise ValueError(f"{topic.name} is published with a part")
         key = topic.key(self._world, part)
@@ -159,11 +172,12 @@ class ZenohBus:
                 raise
 
     def subscribe(self, topics: Iterable[Topic] | None, deliver: Deliver) -> None:
-        """One Zenoh subscriber per topic; for all topics one alone, so that their order of arrival is kept."""
+        """Declares one Zenoh subscriber for each topic. For all topics it declares a single one, so that the order of
+        arrival is kept."""
         keys = [f"{ROOT}/{self._world}/**"] if topics is None else [t.key(self._world) for t in topics]
 
         def receive(sample: zenoh.Sample) -> None:
-            # copies at once, so that shared memory is free again however slow the reader
+            # the bytes are copied at once, so that a slow reader does not keep the shared memory in use
             try:
                 _, topic, part = parse_key(str(sample.key_expr))
             except SaccadeError:
@@ -173,7 +187,7 @@ class ZenohBus:
         self._subscribers += [self._session.declare_subscriber(key, receive) for key in keys]
 
     def answer(self, topics: Iterable[Topic], answer: Answer) -> None:
-        """Answers on a thread of its own: Zenoh's must not wait."""
+        """Answers on a thread of its own, because Zenoh's thread must not wait."""
         def ask(topic: Topic, query: zenoh.Query) -> None:
             self._questions.put((topic, query))
 
@@ -184,7 +198,8 @@ class ZenohBus:
     def _answer_all(self, answer: Answer) -> None:
         while (asked := self._questions.get()) is not None:
             topic, query = asked
-            with contextlib.suppress(self._zenoh.ZError, ValueError, TypeError, KeyError):  # who asks is gone, or mad
+            # the service that asked may be gone, or its question may not be valid
+            with contextlib.suppress(self._zenoh.ZError, ValueError, TypeError, KeyError):
                 question: dict[str, Any] = {"since": None, "limit": 0}
                 if query.payload:
                     question = json.loads(query.payload.to_bytes())
@@ -195,10 +210,10 @@ class ZenohBus:
                 for kept in answer((topic,), since, int(question["limit"])):
                     query.reply(topic.key(self._world, kept.part), kept.payload,
                                 attachment=str(kept.published_ns).encode())
-            del asked, query  # a query ends when it is forgotten
+            del asked, query  # Zenoh ends a query when its object is deleted
 
     def recall(self, topics: Iterable[Topic], since: Since | None = None, limit_bytes: int = PAGE_BYTES) -> list[Kept]:
-        """Asks one topic after the other; what does not begin like a message is left out."""
+        """Asks for one topic after the other. An answer that does not begin like a message is left out."""
         question = json.dumps({"since": since, "limit": limit_bytes})
         return [kept for topic in topics for kept in self._recall(topic, question)]
 
@@ -215,10 +230,11 @@ class ZenohBus:
                         run, episode, step, _ = stamp_of(payload)
                         yield Kept(topic, part, payload, (run, episode, step), int(sample.attachment.to_bytes()))
         except self._zenoh.ZError:
-            return  # no router at present
+            return  # there is no router at present
 
     def join(self, group: str, member: str, met: Met) -> None:
-        """By liveliness: a process that was killed is gone within milliseconds, one that was stopped within seconds."""
+        """Joins by a liveliness token of Zenoh. The others notice within milliseconds that a process was killed, and
+        within seconds that it was suspended."""
         members: set[str] = set()
         key = f"{ROOT}/{self._world}/@members/{group}"
 
@@ -232,7 +248,8 @@ class ZenohBus:
         self._subscribers.append(liveliness.declare_subscriber(f"{key}/*", receive, history=True))
 
     def close(self) -> None:
-        """Undeclares before it closes: a callback left behind can keep a process from ending."""
+        """Undeclares everything before it closes the session, because a callback that is left can keep a process from
+        ending."""
         with self._lock:
             if self._closed:
                 return
@@ -242,12 +259,13 @@ class ZenohBus:
             *self._subscribers, *self._tokens, *self._queryables, *self._publishers.values())
         for entity in entities:
             entity.undeclare()
-        with contextlib.suppress(self._zenoh.ZError):  # someone it was connected to is suspended: not waited for
+        with contextlib.suppress(self._zenoh.ZError):  # the other side is suspended; nobody waits for it
             self._session.close()
 
 
 def free_endpoint(endpoint: str) -> str:
-    """The endpoint with port 0 replaced by a port that is free now."""
+    """Returns the endpoint, with port 0 replaced by a port that is free now. Raises SaccadeError if nothing can listen
+    at this address."""
     match = re.fullmatch(r"(\w+)/(\[[0-9a-fA-F:]+\]|[^\[\]:]+):0", endpoint)
     if match is None:
         return endpoint

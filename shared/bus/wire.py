@@ -1,7 +1,8 @@
-"""Messages on the wire: MessagePack maps with named fields, arrays as one extension type.
+"""The encoding of messages: MessagePack maps with named fields, in which arrays are an extension type.
 
-Everything decoded is checked against the dataclass: an unknown field, a wrong type, shape or dtype, a value that is not
-finite or a payload that is too long raises MessageError, which names the field. Nothing is ever unpickled.
+Everything that is decoded is checked against the dataclass of the message. MessageError names the field if it is
+unknown, missing or there twice, if its type, shape or dtype is wrong, or if a number is not finite. It is also raised
+if the payload is too long. Nothing is ever unpickled.
 """
 
 from __future__ import annotations
@@ -22,18 +23,18 @@ from saccade.shared.errors import printable
 ARRAY_EXTENSION = 1  # msgpack ext type: msgpack([dtype, shape]) followed by the array's bytes, row-major
 MAX_SIDE = 8192
 MAX_BYTES = 32 * 1024 * 1024
-MAX_SMALL_BYTES = 1024 * 1024  # of a message without an image
+MAX_SMALL_BYTES = 1024 * 1024  # limit for a message without an image
 MAX_TEXT = 4096  # bytes
 MAX_LIST = 256
 MAX_FIELDS = 64
 MAX_NAME = 64  # bytes of a field's name
 MAX_REASON = 200  # characters
-HEADER_BYTES = 128  # of an array: more than any needs
-STAMP_BYTES = 512  # and of the fields that all messages have
+HEADER_BYTES = 128  # the header of an array is always shorter than this
+STAMP_BYTES = 512  # the stamp with which a message begins is always shorter than this
 
 
 class MessageError(ValueError):
-    """A payload that is not a valid message; the text names the field. It is short and can be printed."""
+    """A payload is not a valid message. The text names the field; it is short and can be printed."""
 
     def __init__(self, text: str) -> None:
         super().__init__(printable(text, MAX_REASON))
@@ -64,7 +65,8 @@ def _unpack_array(code: int, data: bytes) -> np.ndarray:
 
 
 def encode(message: Message) -> bytes:
-    """The wire bytes of a message; checks it first, so that no service can publish what another must refuse."""
+    """Returns the bytes of a message. Raises MessageError if the message is not valid, so that no service can publish
+    what another one must refuse."""
     fields = {f.name: getattr(message, f.name) for f in dataclasses.fields(message)}
     _check(type(message), fields)
     payload = msgpack.packb({"type": type(message).__name__, "version": message.VERSION, **fields}, default=_pack_array)
@@ -73,7 +75,7 @@ def encode(message: Message) -> bytes:
 
 
 class Stamp(NamedTuple):
-    """What every message begins with."""
+    """The fields with which every message begins."""
 
     run: str
     episode: int
@@ -82,7 +84,8 @@ class Stamp(NamedTuple):
 
 
 def stamp_of(payload: bytes) -> Stamp:
-    """The stamp of an encoded message, without the rest of it. Raises MessageError for what does not begin with one."""
+    """Reads the stamp of an encoded message, without the rest of it. Raises MessageError if the payload does not begin
+    with a stamp."""
     unpacker = msgpack.Unpacker(max_buffer_size=STAMP_BYTES, max_str_len=STAMP_BYTES)
     unpacker.feed(payload[:STAMP_BYTES])
     try:
@@ -97,7 +100,7 @@ def stamp_of(payload: bytes) -> Stamp:
 
 
 def decode(message_type: type[AnyMessage], payload: bytes) -> AnyMessage:
-    """The message in `payload`. Raises MessageError with the field that is wrong."""
+    """Decodes a message of this type. Raises MessageError, which names the wrong field, if the payload is not valid."""
     _check_size(message_type, payload)
     count = scan(payload)
     try:
@@ -121,7 +124,7 @@ def decode(message_type: type[AnyMessage], payload: bytes) -> AnyMessage:
 
 @functools.cache
 def _checks(message_type: type[Message]) -> dict[str, tuple[bool, Any]]:
-    """For each field whether it may be absent, and its ArraySpec or type."""
+    """For each field: whether it may be absent, and its ArraySpec or its type."""
     checks = {}
     for name, hint in field_types(message_type).items():
         optional = isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union
@@ -182,7 +185,7 @@ def _holds_image(message_type: type[Message]) -> bool:
     return any(isinstance(kind, ArraySpec) and "H" in kind.shape for _, kind in _checks(message_type).values())
 
 
-# What a byte of MessagePack begins: a kind, how many bytes tell its size, and its size where none does.
+# For the first byte of a MessagePack value: its kind, how many bytes give its size, and its size if no bytes give it.
 _HEADS = {
     0xC0: ("nil", 0, 0), 0xC2: ("bool", 0, 0), 0xC3: ("bool", 0, 0), 0xCA: ("number", 0, 4), 0xCB: ("number", 0, 8),
     **{0xCC + n: ("number", 0, 2 ** n) for n in range(4)}, **{0xD0 + n: ("number", 0, 2 ** n) for n in range(4)},
@@ -196,8 +199,12 @@ _HEADS = {
 
 
 def scan(payload: bytes) -> int:
-    """How many fields a payload has. Raises MessageError unless it is one map of names to numbers, truth values, texts,
-    lists of texts and arrays, within the limits. Looks at heads alone and builds nothing, however long the payload."""
+    """Returns the number of fields in a payload. It only reads the head of each value and builds no objects, however
+    long the payload is.
+
+    Raises MessageError if the payload is not one map from names to numbers, truth values, texts, lists of texts and
+    arrays, or if it exceeds a limit.
+    """
     kind, count, at = _head(payload, 0)
     if kind != "map" or count > MAX_FIELDS:
         raise MessageError(f"not a map of at most {MAX_FIELDS} fields")
@@ -230,7 +237,8 @@ def _named(name: bytes, what: str) -> MessageError:
 
 
 def _head(payload: bytes, at: int) -> tuple[str, int, int]:
-    """What begins at a place: its kind, its size (bytes, or items of a list or map), and where its content begins."""
+    """Reads the head of the value at position `at`. Returns its kind, its size (in bytes, or in items of a list or
+    map), and the position of its content."""
     if at >= len(payload):
         raise MessageError("ends early")
     kind, width, size = _HEADS.get(payload[at], ("nothing", 0, 0))
