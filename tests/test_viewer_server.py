@@ -153,9 +153,12 @@ def test_the_folder_of_a_killed_viewer_is_removed_by_the_next_and_no_other(tmp_p
     """What is in use, what is another user's, and what is no folder stays."""
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     monkeypatch.setattr(tempfile, "tempdir", None)
-    viewers = [subprocess.Popen([sys.executable, "-c", SHOWN], stdout=subprocess.PIPE, text=True) for _ in range(2)]
+    viewers, folders = [], []
     try:
-        killed, used = (Path(viewer.stdout.readline().split()[1]) for viewer in viewers)
+        for _ in range(2):  # one after the other, or both may choose the same free port
+            viewers.append(subprocess.Popen([sys.executable, "-c", SHOWN], stdout=subprocess.PIPE, text=True))
+            folders.append(Path(viewers[-1].stdout.readline().split()[1]))
+        killed, used = folders
         assert {killed.parent, used.parent} == {tmp_path}
         viewers[0].kill()
         viewers[0].wait()
