@@ -1,4 +1,4 @@
-"""The runner that drives the same cores in one process: for benchmarks, and as the yardstick of what the bus costs."""
+"""Runs the same cores within one process. Benchmarks use it, and it shows what the bus costs."""
 
 from __future__ import annotations
 
@@ -21,8 +21,9 @@ OnStep = Callable[[str, float], None]
 class Pump:
     """Brings messages from core to core within this process, in the order of publication.
 
-    `on_message(topic, part, message, payload)` sees every message; payload is its wire bytes if `encoded`, else None,
-    and messages pass as they are. `on_step(service, milliseconds)` is told what each step of a core took.
+    `on_message(topic, part, message, payload)` sees every message. With `encoded`, `payload` holds the encoded bytes;
+    otherwise it is None, and messages are passed on as they are. `on_step(service, milliseconds)` is told how long each
+    step of a core took.
     """
 
     def __init__(self, steppers: Sequence[Stepper], on_message: OnMessage | None = None, *, encoded: bool = False,
@@ -30,7 +31,7 @@ class Pump:
         self._steppers, self._on_message, self._encoded, self._on_step = steppers, on_message, encoded, on_step
 
     def run(self, outputs: Iterable[Output]) -> None:
-        """Passes on these and all that follows from them, until nobody has anything more to say."""
+        """Passes on these outputs and everything that follows from them, until no core has anything more to say."""
         waiting = deque(outputs)
         while waiting:
             output = waiting.popleft()
@@ -48,10 +49,11 @@ class Pump:
 def run_local(pairs: Sequence[tuple[Service, Core]], parts: tuple[str, ...], run_id: str,
               episodes: Iterable[int] | None = None, on_message: OnMessage | None = None, *, encoded: bool = False,
               on_step: OnStep | None = None) -> None:
-    """Runs the cores in this process: those episodes of the source (the core with `episodes`), in rising order; or all.
+    """Runs the cores within this process, for these episodes of the source in ascending order, or for all its episodes.
 
-    A source that goes by time is not hurried: its next frame comes when the one before it has been worked off. See
-    `Pump` for `on_message`, `encoded` and `on_step`. Raises SaccadeError if a step lacks an input for good.
+    The source is the core with `episodes`. A source that goes by time is not hurried: its next frame comes when the one
+    before it has been worked off. `Pump` describes `on_message`, `encoded` and `on_step`. Raises SaccadeError if there
+    is not exactly one source, or if an episode cannot go on because a step lacks an input.
     """
     sources = [Stepper(s, c, parts, source=True) for s, c in pairs if hasattr(c, "episodes")]
     if len(sources) != 1:

@@ -1,4 +1,4 @@
-"""The one main loop of every service."""
+"""The main loop, which every service uses."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ from saccade.shared.loop.stepper import Stepper
 from saccade.shared.loop.ticker import Ticker
 
 READY_STATES = ("ready", "busy")
-IDLE_S = 1.0  # after so long without a message a service asks for what it lacks, and says so
+IDLE_S = 1.0  # after this time without a message a service asks for what it lacks, and says so
 WAITS = "waits for "
 
 
 def main(name: str, argv: Sequence[str] | None = None) -> None:
-    """A service's whole process: `--config RUN/config.json`, then messages in, messages out, until SIGTERM.
+    """The process of a service: it reads `--config RUN/config.json`, then takes and publishes messages until SIGTERM.
 
-    It is the service of that name: ours, or the one from outside that the configuration puts in its place. Bad input
-    ends the process with one line and code 2.
+    The configuration can put a module from outside in the place of the service `name`. If the input is wrong, the
+    process prints one line and ends with exit code 2.
     """
     def work(config: Config, folder: Path, inbox: Inbox) -> None:
         _work(load(name, config, compare=False), config, folder, inbox)
@@ -43,7 +43,7 @@ def main(name: str, argv: Sequence[str] | None = None) -> None:
 
 
 def run_module(module: ServiceModule, argv: Sequence[str] | None = None) -> None:
-    """`main` for a service that the configuration does not name."""
+    """Does the same as `main` for a service that the configuration does not name."""
     run_process(module.service.name, lambda config, folder, inbox: _work(module, config, folder, inbox), argv=argv)
 
 
@@ -60,14 +60,14 @@ def _work(module: ServiceModule, config: Config, folder: Path, inbox: Inbox) -> 
 def serve(service: Service, core: Core, bus: Bus, parts: tuple[str, ...], *, run: str,
           wait_for: tuple[str, ...] = (), inbox: Inbox | None = None, live: bool = False,
           first_step: int = 0) -> Health:
-    """Runs a core on a bus until `inbox` is stopped; returns what it counted.
+    """Runs a core on a bus until `inbox` is stopped. Returns what the service has counted.
 
-    A source, whose core has `episodes`, begins them itself, the first once every service in `wait_for` is ready; one
-    that goes by time publishes a frame a period.
+    A source, which is a core with `episodes`, begins its episodes itself. It begins the first one when every service in
+    `wait_for` is ready. A source that goes by time publishes one frame per period.
 
-    What was published before this service was there, or while it or the router was away, is asked for: at the start,
-    and whenever nothing comes. So a service that is started again folds the episode so far and goes on. `live`, it
-    goes on with the newest.
+    The service asks for messages that were published before it was there, or while it or the router was away. It does
+    so at the start and whenever nothing arrives. So a service that was started again repeats the episode so far and
+    continues. With `live` it continues with the newest step instead.
     """
     inbox, source = inbox or Inbox(), hasattr(core, "episodes")
     stepper = Stepper(service, core, parts, source=source, live=live, first_step=first_step, run=run)
@@ -98,13 +98,13 @@ def serve(service: Service, core: Core, bus: Bus, parts: tuple[str, ...], *, run
 
 
 class _Loop:
-    """What one service does with one message."""
+    """What a service does with each message."""
 
     def __init__(self, stepper: Stepper, bus: Bus, run: str, wait_for: tuple[str, ...], *, live: bool) -> None:
         service, core = stepper.service, stepper.core
         self.health, self.outbox, self.awaited = Health(service.name), Outbox(), set(wait_for)
         self.topics = service.inputs + ((service.closed_by,) if service.closed_by else ())
-        self._source = stepper.episode_done  # between episodes from the start
+        self._source = stepper.episode_done  # a source begins between two episodes
         self._stepper, self._bus, self._run, self._service = stepper, bus, run, service
         self.notes = "\n".join(getattr(core, "notes", ()))
         self._ticker = Ticker(core.period_s) if stepper.timed else None
@@ -118,17 +118,17 @@ class _Loop:
 
     @property
     def watched(self) -> tuple[Topic, ...]:
-        """What replicas of this service say: what one has answered the others need not."""
+        """The outputs of this service, if it has replicas. What one replica has answered, the others do not answer."""
         return self._service.outputs if self._share else ()
 
     @property
     def looks_ahead(self) -> bool:
-        """Whether everything that has come is looked at before a step is taken."""
+        """Whether the service looks at everything that has arrived before it takes a step."""
         return self._live or self._share is not None
 
     def join(self, inbox: Inbox) -> None:
-        """Meets the replicas of this service, if it is one that can be shared. A source must be alone: raises
-        SaccadeError where another one is there."""
+        """Meets the replicas of this service if it can be shared. A source must be alone: raises SaccadeError if this
+        is a source and another one is there."""
         if self._share:
             self._share.meet(self._bus, inbox.wake)
             inbox.stopping.wait(MEET_S)
@@ -139,7 +139,7 @@ class _Loop:
             alone_on(self._bus, self._service.name)
 
     def share_if_due(self) -> None:
-        """Takes over from a replica that is gone, gives to one that has come."""
+        """Takes over objects from a replica that is gone, and gives objects to one that has come."""
         if not self._share or not self._share.changed:
             return
         before, core = set(self._stepper.core.names), self._stepper.core
@@ -151,7 +151,7 @@ class _Loop:
         self.health.say(note=self.notes)
 
     def handle(self, topic: Topic, part: str | None, payload: bytes, *, more: bool = False) -> None:
-        """Takes a message; runs the core for every complete step, unless there are `more` to look at first."""
+        """Takes a message. Runs the core for every complete step, unless there are `more` messages to look at first."""
         if topic == STATUS:
             self._note_status(part, payload)
             return
@@ -163,13 +163,13 @@ class _Loop:
             self.work_off(topic, part)
 
     def work_off(self, topic: Topic, part: str | None = None) -> None:
-        """Every step that is complete."""
+        """Runs the core for every step that is complete."""
         while self._step(topic, part, self._stepper.advance):
             self.begin_if_due()
 
     def _note_answer(self, topic: Topic, part: str | None, payload: bytes) -> None:
-        """Keeps what another replica said: should that one die, this one can still be asked for it. What is no message
-        is no answer."""
+        """Keeps what another replica has said, so that others can ask for it here if that replica dies. A payload that
+        is not a message is ignored."""
         with suppress(MessageError):
             if self._share and not self._share.is_answered(topic, part, stamp_of(payload)):
                 message = decode(topic.type, payload)
@@ -187,12 +187,12 @@ class _Loop:
             self._stepper.offer(topic, part, message)
         except MessageError as error:
             self.health.refuse(topic, part, error)
-            if topic not in self._refused:  # once, for whoever reads what the process prints
+            if topic not in self._refused:  # printed once per topic, for the log of the process
                 self._refused.add(topic)
                 print(f"saccade: {self.health.service}: {self.health.note}", file=sys.stderr, flush=True)
 
     def begin_if_due(self) -> None:
-        """Begins a source's next episode, if everyone is there and the one before it is over and closed."""
+        """Begins a source's next episode if all services are ready and the last episode is over and closed."""
         while self._source and not self.awaited and self._stepper.episode_done and self._is_closed:
             if self._next_episode >= self._end:
                 self.health.say("finished")
@@ -203,7 +203,7 @@ class _Loop:
                 self._ticker.start()
 
     def tick_if_due(self) -> None:
-        """The next frame of a source that goes by time."""
+        """Publishes the next frame of a source that goes by time, if it is due."""
         if self._ticker and self._ticker.take():
             self._step(None, None, self._stepper.tick)
             if self._stepper.episode_done:
@@ -216,8 +216,8 @@ class _Loop:
         return self._ticker.wait_s if self._ticker else math.inf
 
     def catch_up(self) -> None:
-        """Asks for inputs that were published and have not come, until there are none that lead on. Where nobody waits
-        what is past is past: only what holds for the whole episode is asked for."""
+        """Asks for inputs that were published and have not arrived, until the answers complete no further step. In live
+        mode it asks only for latched messages, because past steps do not count there."""
         latched = [topic for topic in self.topics if topic.latched and topic != self._service.closed_by]
         others = [topic for topic in self.topics if topic not in latched and not self._live]
         while not self.awaited:
@@ -230,7 +230,8 @@ class _Loop:
                 return
 
     def say_what_lacks(self) -> None:
-        """Nothing has come for a while: puts the inputs that the next step still needs into the status."""
+        """Writes into the status which inputs the next step still needs. It is called when nothing has arrived for a
+        while."""
         if lacks := self._stepper.waits_for():
             self.health.say(note=WAITS + ", ".join(lacks))
 
@@ -247,11 +248,11 @@ class _Loop:
         try:
             status = decode(STATUS.type, payload)
         except MessageError:
-            return  # whoever sent it is not ready
+            return  # the service that sent it does not count as ready
         if part in self.awaited and status.state in READY_STATES:
             self.awaited.discard(part)
-            if status.run == self._run:  # this source was here before: the others are in that episode already
-                past = 1 if self._ticker else 0  # what one that goes by time has shown does not come back
+            if status.run == self._run:  # this source was started again: the others are in that episode already
+                past = 1 if self._ticker else 0  # a source that goes by time cannot repeat its frames
                 self._next_episode = max(self._next_episode, status.episode + past)
                 self._closed = self._next_episode - 1
                 self._end = self._stepper.core.episodes + past * self._next_episode
@@ -261,7 +262,7 @@ class _Loop:
                 self.catch_up()
 
     def _step(self, topic: Topic | None, part: str | None, make: Callable[[], list[Output] | None]) -> bool:
-        """Runs the core once and publishes what it made; whether there was anything to do."""
+        """Runs the core once and publishes its outputs. Returns whether there was anything to do."""
         before, self.health.state = self.health.state, "busy"
         start = time.perf_counter()
         try:
@@ -287,7 +288,7 @@ class _Loop:
         if self._share:
             outputs = [o for o in outputs if not self._share.is_answered(o.topic, o.part, o.message)]
         encoded = []
-        for output in outputs:  # all before the first is sent: a step is published as a whole or not at all
+        for output in outputs:  # all, before the first is sent: a step is published whole or not at all
             try:
                 encoded.append(encode(output.message))
             except MessageError as error:

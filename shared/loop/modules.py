@@ -1,4 +1,5 @@
-"""Which module a service of a run is: one of ours, or one from outside that the configuration puts in its place."""
+"""Finds the module of a service. It is one of Saccade's, or a module from outside that the configuration puts in its
+place."""
 
 from __future__ import annotations
 
@@ -12,23 +13,23 @@ from saccade.shared.config import Config
 from saccade.shared.errors import SaccadeError
 from saccade.shared.loop.service import Core, Service
 
-SOURCES = ("simulator", "camera")  # a run has one of them, in whose place `services.source` stands
+SOURCES = ("simulator", "camera")  # a run has one of them, and `services.source` replaces it
 EXAMPLE = "see examples/greedy_planner"
 
 
 class ServiceModule(NamedTuple):
-    """A service's declaration, and what builds its core."""
+    """A service's declaration, and the function that builds its core."""
 
     service: Service
     build: Callable[[Config], Core]
 
 
 def load(name: str, config: Config, *, compare: bool = True) -> ServiceModule:
-    """The service of that name in a run.
+    """Returns the service that has this name in a run.
 
-    Raises SaccadeError where the configuration names a module that cannot be imported, that declares no SERVICE or
-    builds no core, or that says other things than the service in whose place it stands. Not to `compare` spares a
-    process from importing ours, once it is known that they agree.
+    Raises SaccadeError if the configuration names a module that cannot be imported, that has no SERVICE or no function
+    `build`, or whose declaration does not fit the service that it replaces. With `compare=False` the last check is left
+    out. A process then need not import Saccade's own module, once it is known that the two agree.
     """
     ours = f"saccade.services.{name}.core"
     key = f"services.{'source' if name in SOURCES else name}"
@@ -39,7 +40,7 @@ def load(name: str, config: Config, *, compare: bool = True) -> ServiceModule:
     told = f"{key}: module {chosen!r}"
     try:
         module = import_module(chosen)
-    except Exception as error:  # whatever a module from outside does as it is imported
+    except Exception as error:  # a module from outside may raise anything when it is imported
         why = re.sub(r"\s+", " ", str(error)) or type(error).__name__
         raise SaccadeError(f"{told} cannot be imported ({why}): install it, or put its folder on PYTHONPATH") from error
     service, build = getattr(module, "SERVICE", None), getattr(module, "build", None)
@@ -53,7 +54,8 @@ def load(name: str, config: Config, *, compare: bool = True) -> ServiceModule:
 
 
 def _require_alike(told: str, service: Service, ours: Service) -> None:
-    """What others rely on: the name by which they know it, what it says, and how its episodes end."""
+    """Checks what other services rely on: the name, the outputs, the trigger, and how episodes are closed. Raises
+    SaccadeError if one of them does not fit."""
     if service.name != ours.name:
         raise SaccadeError(f"{told} calls itself {service.name!r}: it stands in the place of {ours.name!r}, call it so")
     if set(service.outputs) != set(ours.outputs):

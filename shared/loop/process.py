@@ -1,4 +1,4 @@
-"""What every service process has around its work: arguments, signals, heartbeat, exit code."""
+"""What surrounds the work of every service process: arguments, signals, heartbeat and exit code."""
 
 from __future__ import annotations
 
@@ -23,21 +23,24 @@ from saccade.shared.config import Config, load
 from saccade.shared.errors import SaccadeError
 
 HEARTBEAT_S = 0.5
-SHORTEST_S = 0.05  # between two statuses, however many messages are refused
-QUIET_S = 0.1  # a service told to stop first works off what is already on its way: until nothing came for so long,
-DRAIN_S = 1.0  # or for so long in all
+SHORTEST_S = 0.05  # shortest time between two statuses, however many messages are refused
+# A service that is told to stop first works off the messages that are already on their way. It ends when nothing has
+# arrived for QUIET_S, or after DRAIN_S in all.
+QUIET_S = 0.1
+DRAIN_S = 1.0
 EXIT_ERROR = 2
 NOTE_LENGTH = 1000
 REFUSED = "refused: "
 STARTING = "starting"
-HEARTBEAT_VARIABLE = "SACCADE_HEARTBEAT"  # a file for whoever is not on the bus: its age and the state in it
-LAUNCHER_VARIABLE = "SACCADE_LAUNCHER"  # the launcher's process id: the service stops if that is no longer its parent
+HEARTBEAT_VARIABLE = "SACCADE_HEARTBEAT"  # names a file for programs that are not on the bus; it holds the state
+LAUNCHER_VARIABLE = "SACCADE_LAUNCHER"  # the launcher's process id; the service stops if it loses this parent
 
 Item = tuple[Topic, str | None, bytes]
 
 
 class Inbox:
-    """Items from the bus's thread for the main thread; beyond `limit_bytes` new ones are dropped and counted."""
+    """Hands items from the bus's thread to the main thread. If it holds `limit_bytes`, it drops new items and counts
+    them."""
 
     def __init__(self, limit_bytes: int | None = None) -> None:
         self.stopping = threading.Event()
@@ -46,7 +49,7 @@ class Inbox:
         self._queue: queue.SimpleQueue[Item | None] = queue.SimpleQueue()
 
     def put(self, topic: Topic, part: str | None, payload: bytes) -> None:
-        """For `Bus.subscribe`; never blocks."""
+        """Adds an item. It is made for `Bus.subscribe` and never blocks."""
         with self._lock:
             if self._limit is not None and self._held + len(payload) > self._limit:
                 self.dropped += 1
@@ -55,12 +58,12 @@ class Inbox:
         self._queue.put((topic, part, payload))
 
     def stop(self) -> None:
-        """Wakes `get` with None and ends `items`. Safe in a signal handler."""
+        """Makes `get` return None, and ends `items`. It may be called in a signal handler."""
         self.stopping.set()
         self._queue.put(None)
 
     def get(self, timeout_s: float | None = None) -> Item | None:
-        """The next item; None after `timeout_s` seconds and where `stop` was called."""
+        """Returns the next item. Returns None after `timeout_s` seconds without one, or if `stop` was called."""
         with contextlib.suppress(queue.Empty):
             item = self._queue.get(timeout=timeout_s)
             if item is not None:
@@ -70,22 +73,26 @@ class Inbox:
         return None
 
     def wake(self) -> None:
-        """Has `items` give a None soon, where it has a `tick_s`."""
+        """Makes `items` yield None soon, if it has a `tick_s`."""
         self._queue.put(None)
 
     @property
     def waiting(self) -> bool:
-        """Whether something is there to be taken."""
+        """Whether an item is there to be taken."""
         return not self._queue.empty()
 
     def items(self, drain_s: float = DRAIN_S, tick_s: float | None = None,
               wait_s: Callable[[], float] = lambda: math.inf) -> Iterator[Item | None]:
-        """Every item up to `stop`, then what follows without a pause, for `drain_s` seconds at most. With `tick_s`
-        also None whenever nothing came for so long, or for `wait_s()` where that is less."""
+        """Yields every item until `stop`, and after it those that follow without a pause, for at most `drain_s`
+        seconds.
+
+        With `tick_s` it also yields None whenever nothing has arrived for `tick_s` seconds, or for `wait_s()` seconds
+        if that is less.
+        """
         while True:
             item = self.get(None if tick_s is None else min(tick_s, wait_s()))
             if item is None and self.stopping.is_set():
-                break  # behind everything that came before `stop`, but for a tick at that very moment
+                break  # everything that came before `stop` has been taken, except after a tick at that very moment
             if item is not None or tick_s is not None:
                 yield item
         end = time.monotonic() + drain_s
@@ -95,7 +102,7 @@ class Inbox:
 
 @dataclass
 class Health:
-    """What a service says about itself; plain numbers written by its main thread, read by the heartbeat."""
+    """What a service says about itself. Its main thread writes these plain numbers, and the heartbeat reads them."""
 
     service: str
     state: str = STARTING
@@ -110,18 +117,18 @@ class Health:
     changed: threading.Event = field(default_factory=threading.Event)
 
     def say(self, state: str | None = None, note: str | None = None) -> None:
-        """Changes state or note, and has it published soon."""
+        """Changes the state or the note. The heartbeat publishes the change soon."""
         self.state = self.state if state is None else state
         self.note = self.note if note is None else note[:NOTE_LENGTH]
         self.changed.set()
 
     def refuse(self, topic: Topic, part: str | None, reason: object) -> None:
-        """Counts a message that was no good and says which field of it."""
+        """Counts a message that is not valid, and puts the reason into the note."""
         self.refused += 1
         self.say(note=f"{REFUSED}{topic.name}{f'/{part}' if part else ''}: {reason}")
 
     def status(self, seq: int) -> Status:
-        """The message for the bus."""
+        """Returns the status message for the bus."""
         run, episode, step = self.at
         return Status(run=run, episode=episode, step=step, seq=seq, service=self.service, state=self.state,
                       received=self.received, published=self.published, refused=self.refused, skipped=self.skipped,
@@ -129,7 +136,10 @@ class Health:
 
 
 class Heartbeat:
-    """Publishes a Health every half second and at once when it changes, also while the main thread is busy."""
+    """Publishes a Health every half second, and at once when it changes. It does so even while the main thread is busy.
+
+    Calls `on_orphaned` if the launcher that started this process is gone.
+    """
 
     def __init__(self, bus: Bus, health: Health, on_orphaned: Callable[[], None] = lambda: None) -> None:
         self._bus, self._health, self._on_orphaned = bus, health, on_orphaned
@@ -159,7 +169,7 @@ class Heartbeat:
 
     def _publish(self) -> None:
         if self._file:
-            with contextlib.suppress(OSError):  # whoever reads it sees that it grows old
+            with contextlib.suppress(OSError):  # a reader of the file sees that it grows old
                 Path(self._file).write_text(self._health.state)
         self._bus.publish(STATUS, self._health.service, encode(self._health.status(self._seq)))
         self._seq += 1
@@ -167,9 +177,11 @@ class Heartbeat:
 
 def run_process(name: str, work: Callable[[Config, Path, Inbox], None], *, inbox: Inbox | None = None,
                 argv: Sequence[str] | None = None) -> None:
-    """`work(config, folder, inbox)` between the command line and the exit code; `folder` is the configuration file's.
+    """Calls `work(config, folder, inbox)` between the command line and the exit code. `folder` is the folder of the
+    configuration file.
 
-    SIGTERM and SIGINT stop the inbox, a second one the process. SaccadeError is one line on stderr and exit code 2.
+    The first SIGTERM or SIGINT stops the inbox, a second one ends the process at once. SaccadeError is printed as one
+    line on stderr, with exit code 2.
     """
     parser = argparse.ArgumentParser(prog=f"python -m services.{name}", description=f"Saccade's {name} service.")
     parser.add_argument("--config", type=Path, required=True, metavar="FILE", help="configuration of the run (JSON)")

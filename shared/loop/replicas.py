@@ -1,7 +1,7 @@
-"""Who else does the same work on this bus, and which objects each of them answers for.
+"""Knows which replicas of a service are on the bus, and which objects each of them answers for.
 
-Replicas of a service share the run's objects by rendezvous hashing: all who know the same members come to the same
-shares, and one that joins or dies moves few objects.
+Replicas share the objects of the run by rendezvous hashing. All replicas that know the same members compute the same
+shares, and few objects change hands when a member joins or dies.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from saccade.shared.bus.wire import Stamp
 from saccade.shared.errors import SaccadeError
 from saccade.shared.loop.service import Service
 
-MEET_S = 0.1  # after so long one that has joined knows who else is there
-JOIN_S = 0.5  # one that has joined lets the others finish what they have begun
+MEET_S = 0.1  # after this time a replica that has joined knows the others
+JOIN_S = 0.5  # a replica that has joined waits this long, so that the others finish what they began
 
 
 def shares(parts: Iterable[str], members: Iterable[str]) -> dict[str, str]:
-    """For each part the member that answers for it: the one that scores highest for it, of those that have room. Shares
-    differ by one at most."""
+    """Returns, for each part, the member that answers for it. This is the member with the highest score for the part
+    among those that have room. The numbers of parts differ by one at most between members."""
     parts, members = list(parts), sorted(members)
     least, more = divmod(len(parts), len(members))
     held, owners = dict.fromkeys(members, 0), {}
@@ -37,8 +37,8 @@ def shares(parts: Iterable[str], members: Iterable[str]) -> dict[str, str]:
 
 
 def alone_on(bus: Bus, name: str) -> None:
-    """Says on the bus that this is the world's service of that name, of which there can be one only. Raises
-    SaccadeError where another one was there before."""
+    """Announces on the bus that this is the service of that name, of which a world can have only one. Raises
+    SaccadeError if another one was there before."""
     me = f"{time.time_ns():020d}-{uuid.uuid4().hex}"
     others: set[str] = set()
     bus.join(name, me, others.update)
@@ -53,10 +53,10 @@ def _score(part: str, member: str) -> bytes:
 
 
 class Share:
-    """What one replica answers for, and what was answered already, by it or by others.
+    """What one replica answers for, and what was already answered by any replica.
 
-    In lockstep the next step begins only when every object of this one is answered, so at most the last step can lack
-    something when a replica dies.
+    In lockstep the next step begins only when every object of the present one is answered. So when a replica dies, at
+    most the last step can lack an answer.
     """
 
     def __init__(self, service: Service, parts: tuple[str, ...], me: str | None = None) -> None:
@@ -65,11 +65,12 @@ class Share:
         self._answered: dict[Key, tuple[Episode, set[int]]] = {}  # of each key: the newest episode and its steps
 
     def met(self, members: frozenset[str]) -> None:
-        """Who is there now, maybe without this one yet; from the bus's thread."""
+        """Takes the present members, maybe without this one yet. It is called on the bus's thread."""
         self._known = members | {self.me}
 
     def meet(self, bus: Bus, wake: Callable[[], None]) -> None:
-        """Says on the bus that this one is there; calls `wake`, from the bus's thread, when another comes or goes."""
+        """Announces this replica on the bus. Calls `wake` on the bus's thread whenever another replica comes or
+        goes."""
         def met(members: frozenset[str]) -> None:
             self.met(members)
             wake()
@@ -78,17 +79,17 @@ class Share:
 
     @property
     def changed(self) -> bool:
-        """Whether others have come or gone since `take_mine`."""
+        """Whether other replicas have come or gone since `take_mine`."""
         return self._known != self._members
 
     def take_mine(self) -> tuple[str, ...]:
-        """The parts of this replica as things are now, in the order of the run's."""
+        """Returns the parts that this replica now answers for, in the order of the run's parts."""
         self._members = self._known
         owners = shares(self._parts, self._members)
         return tuple(part for part in self._parts if owners[part] == self.me)
 
     def answered(self, topic: Topic, part: str | None, stamp: Stamp | Message) -> None:
-        """A message of this service was published."""
+        """Notes that a message of this service was published."""
         episode, key = (stamp.run, stamp.episode), (topic.name, part)
         known = self._answered.get(key)
         if known is None or known[0][0] != stamp.run or known[0] < episode:
@@ -97,11 +98,11 @@ class Share:
             known[1].add(stamp.step)
 
     def is_answered(self, topic: Topic, part: str | None, stamp: Stamp | Message) -> bool:
-        """Whether someone has published this message."""
+        """Whether a replica has published this message."""
         return self._has(topic, part, (stamp.run, stamp.episode, stamp.step))
 
     def lacks(self, mine: Iterable[str], at: tuple[str, int, int]) -> bool:
-        """Whether any of these parts is still to be answered for a step."""
+        """Whether any of these parts (`mine`) has no answer yet for the step `at` (run, episode, step)."""
         return any(not self._has(topic, part, (*at[:2], 0) if topic.latched else at)
                    for topic in self._service.outputs for part in mine)
 

@@ -1,4 +1,5 @@
-"""What a service is: a declaration of topics and a pure core. Wiring, replay and the process graph derive from it."""
+"""What a service is: a declaration of topics, and a core without side effects. The bus loop, the replay and the graph
+of processes all follow from the declaration."""
 
 from __future__ import annotations
 
@@ -11,10 +12,14 @@ from saccade.shared.bus.topics import Output, Topic
 
 @dataclass(frozen=True)
 class Service:
-    """A declaration. The core runs once per step of `trigger`, when all `inputs` of that step (and the latched ones of
-    the episode) are there. A source (the simulator, a camera) begins episodes by itself; `closed_by` is the topic that
-    must have answered an episode that is done before the next one begins. The core of a `divisible` one answers for
-    each object by itself, from the step's inputs alone: replicas may share the objects (`DivisibleCore`)."""
+    """A declaration of a service.
+
+    The core runs once for each step of `trigger`, when all `inputs` of that step and the latched inputs of the episode
+    are there. A source (the simulator, a camera) begins episodes by itself. When one of its episodes is done, it waits
+    for a message of `closed_by` about this episode before it begins the next one. The core of a `divisible` service
+    computes its answer for each object separately, from the inputs of the step alone, so that replicas can share the
+    objects (`DivisibleCore`).
+    """
 
     name: str
     inputs: tuple[Topic, ...]
@@ -28,13 +33,14 @@ Inputs = dict[str, Any]  # topic name -> message, or {part: message} for a topic
 
 
 class Core(Protocol):
-    """Messages in, messages out: no bus, no clock, no files. Its state is a fold over its inputs since `begin`."""
+    """Messages go in, messages come out. A core uses no bus, no clock and no files. Its state depends only on its
+    inputs since `begin`."""
 
     def begin(self, run: str, episode: int) -> Iterable[Output]:
-        """A new episode: forget everything; sources publish their first messages."""
+        """Begins a new episode and forgets everything before it. A source yields its first messages."""
 
     def step(self, inputs: Inputs) -> Iterable[Output]:
-        """All inputs of one step."""
+        """Takes all inputs of one step and yields the outputs."""
 
 
 class Source(Core, Protocol):
@@ -42,24 +48,24 @@ class Source(Core, Protocol):
 
     @property
     def episodes(self) -> int:
-        """How many."""
+        """Number of episodes."""
 
 
 class DivisibleCore(Core, Protocol):
-    """A core that answers for some of the objects."""
+    """A core that answers for some of the objects, which can change during a run."""
 
-    names: tuple[str, ...]  # for these, now
+    names: tuple[str, ...]  # the objects that it answers for now
 
     def share(self, names: tuple[str, ...]) -> None:
-        """From now on for these, maybe none."""
+        """Answers for these objects from now on. There may be none."""
 
 
 class TimedSource(Source, Protocol):
-    """A source that goes by time, not by actions: its episode ends when there is no next frame."""
+    """A source that goes by time, not by actions. Its episode ends when there is no next frame."""
 
-    period_s: float  # from one frame to the next
-    notes: tuple[str, ...]  # for the user, a line each
-    skipped: int  # images that it could not publish
+    period_s: float  # time from one frame to the next
+    notes: tuple[str, ...]  # lines for the user
+    skipped: int  # number of images that it could not publish
 
     def next_frame(self) -> Iterable[Output]:
-        """What it sees next; nothing when that was all."""
+        """Yields what it sees next. It yields nothing when there are no more frames."""

@@ -1,6 +1,8 @@
-"""Which inputs belong together, when a core may step, and what number its messages get: pure, without bus or clock.
+"""Decides which inputs belong together, when a core may run, and which numbers its messages get, without a bus or a
+clock.
 
-The bus loop and the in-process runner both drive cores through `Stepper`, so that their outputs are equal to the byte.
+The loop on the bus and the runner within one process both drive the cores through `Stepper`. So their outputs are equal
+to the byte.
 """
 
 from __future__ import annotations
@@ -18,21 +20,25 @@ from saccade.shared.bus.wire import MessageError
 from saccade.shared.errors import SaccadeError
 from saccade.shared.loop.service import Core, Service
 
-MAX_PENDING = 256  # incomplete steps kept, so that a flood of stray messages cannot fill the memory
+MAX_PENDING = 256  # incomplete steps that are kept; a flood of stray messages cannot fill the memory
 
 Episode = tuple[str, int]  # run and number
 Slot = dict[str, dict[str | None, Message]]  # topic name -> part -> message
 
 
 class Stepper:
-    """One core between its inputs and its outputs.
+    """Connects one core with its inputs and outputs.
 
-    `offer` files a message, `advance` runs the core if a step is complete. In lockstep each step of an episode is
-    taken, from the first (`first_step`; a log that was cut begins later): a core's state is a fold over all of them,
-    and what is lacking can be asked for (`wants`). `live`, the newest complete step is taken and those before it are
-    skipped. A latched message of step s holds from step s of its episode. `parts` are the names of the run's objects.
-    For a source, `begin` starts an episode, and the inputs must answer the step it published last. With `run`, messages
-    of other runs are refused.
+    `offer` takes an input, and `advance` runs the core if a step is complete. `parts` are the names of the run's
+    objects. A latched message of step s holds from step s of its episode on. With `run`, messages of other runs are
+    refused.
+
+    In lockstep every step of an episode is taken, from `first_step` on (a log that was cut begins later than at 0).
+    This is because the state of a core depends on all steps. Inputs that are missing can be asked for (`wants`). With
+    `live`, the newest complete step is taken, and the steps before it are skipped.
+
+    For a source, `begin` starts an episode, and the inputs must answer the last step that it published. Raises
+    SaccadeError if the trigger of the service is not among its inputs.
     """
 
     def __init__(self, service: Service, core: Core, parts: tuple[str, ...], *, source: bool = False,
@@ -40,10 +46,10 @@ class Stepper:
         if service.trigger not in service.inputs:
             raise SaccadeError(f"service {service.name}: its trigger {service.trigger.name} is not among its inputs")
         self.service, self.parts = service, parts
-        self.core: Any = core  # what it has beside a Core's methods depends on its kind
+        self.core: Any = core  # it may have more than a Core's methods, depending on its kind
         self.skipped = 0  # steps that never became complete
         self.episode_done = source  # a source is between episodes
-        self.at: tuple[str, int, int] = ("", 0, 0)  # run, episode, step last begun or stepped
+        self.at: tuple[str, int, int] = ("", 0, 0)  # run, episode and step that were begun or taken last
         self._source, self._live, self._first_step, self._run = source, live, first_step, run
         self._begun: Episode | None = None
         self._past_runs: set[str] = set()
@@ -56,7 +62,7 @@ class Stepper:
         self._topics = {topic.name: topic for topic in service.inputs}
 
     def offer(self, topic: Topic, part: str | None, message: Message) -> None:
-        """Files an input. One that comes too late is ignored. Raises MessageError for one that fits nowhere."""
+        """Takes an input. An input that comes too late is ignored. Raises MessageError if the input fits nowhere."""
         if topic.name not in self._topics:
             raise MessageError("topic: not an input")
         if topic.parts and part not in self.parts:
@@ -83,7 +89,7 @@ class Stepper:
         return self._emit(self._start((run, episode)))
 
     def tick(self) -> list[Output]:
-        """The next frame of a source that goes by time; without one its episode is done."""
+        """Returns the next frame of a source that goes by time. If there is none, the episode is done."""
         outputs = self._emit(self.core.next_frame())
         self.episode_done |= not outputs
         return outputs
@@ -94,7 +100,8 @@ class Stepper:
         return self._source and hasattr(self.core, "next_frame")
 
     def advance(self) -> list[Output] | None:
-        """Runs the core on the next complete step: its stamped outputs, or None if no step is complete."""
+        """Runs the core on the next complete step. Returns the outputs with their sequence numbers, or None if no step
+        is complete."""
         while True:
             at = self._next_complete()
             if at is None:
@@ -108,18 +115,20 @@ class Stepper:
             return first + (self._emit(self.core.step(inputs)) if self.is_due(at) else [])
 
     def again(self) -> list[Output]:
-        """The outputs of the last step once more, from a core that answers for other objects now."""
+        """Returns the outputs of the last step once more. It is used when the core answers for other objects than
+        before."""
         return [] if self._inputs_taken is None else self._emit(self.core.step(self._inputs_taken))
 
     @property
     def wants(self) -> tuple[str, int, int] | None:
-        """Run, episode and step from which on inputs are needed; None before the first episode."""
+        """The run, the episode and the first step for which inputs are needed. None before the first episode."""
         if self._begun is None:
             return None
         return (*self._begun, max(0, self._last_step if self._source else self._last_step + 1))
 
     def waits_for(self) -> list[str]:
-        """What the next step lacks, as texts such as 'percept/mug of step 3'; empty if nothing is open."""
+        """What the next step lacks, as texts such as 'percept/mug of step 3 of episode 0'. Empty if no step is
+        waiting."""
         if self._slots:
             at = min(self._slots, key=lambda a: a[1:])
         elif self._begun is not None and self._source and not (self.timed or self.episode_done):
@@ -133,8 +142,8 @@ class Stepper:
                 for name, part in self._lacks(at)]
 
     def _require_of_this_run(self, message: Message) -> None:
-        """Raises MessageError for a message of another run, or of an episode after the next: episodes follow one
-        another."""
+        """Raises MessageError if the message belongs to another run, or to an episode after the next one. Episodes
+        follow one another, so such an episode cannot have begun."""
         if self._run is None:
             return
         if message.run != self._run:
@@ -181,7 +190,7 @@ class Stepper:
         complete = [at for at in self._slots if self._is_due(at) and not self._lacks(at)]
         if not complete:
             return None
-        run = complete[0][0]  # runs follow one another in order of arrival, their steps by number
+        run = complete[0][0]  # runs are taken in the order of their arrival, the steps of a run by number
         return (max if self._live else min)(at for at in complete if at[0] == run)
 
     def _is_due(self, at: tuple[str, int, int]) -> bool:
@@ -213,14 +222,15 @@ class Stepper:
         return Stamper(self._first_step if self.service.divisible and not self._live else None)
 
     def _forget(self, at: tuple[str, int, int]) -> None:
-        """Drops the step and those before it: of one key all came in order, so what these lack is lost."""
+        """Drops the step and those before it. The messages of one key arrive in order, so what the earlier steps lack
+        is lost."""
         del self._slots[at]
         for old in [a for a in self._slots if a[0] in self._past_runs or (a[0] == at[0] and a[1:] < at[1:])]:
             self._skip(old)
 
     def _skip(self, at: tuple[str, int, int]) -> None:
         del self._slots[at]
-        self.skipped += not self._source  # what a source skips are images, and it counts them itself
+        self.skipped += not self._source  # a source skips images, and it counts them itself
 
     def _emit(self, outputs: Iterable[Output] | None) -> list[Output]:
         stamped = []
@@ -241,10 +251,11 @@ def _same(one: Message, other: Message) -> bool:
 
 
 def settle(message: Message) -> Message:
-    """The message with arrays that are aligned, contiguous and frozen.
+    """Returns the message with arrays that are aligned in memory, contiguous and read-only.
 
-    Bytes from the wire are seldom aligned, and NumPy may sum unaligned numbers in another order: without this the same
-    message would give other bytes in another process. Frozen, no core can change what another one holds.
+    Bytes from the bus are seldom aligned, and NumPy may sum unaligned numbers in another order. Without this, the same
+    message would give other bytes in another process. The arrays are read-only so that no core can change what another
+    one holds.
     """
     changed: dict[str, Any] = {}
     for field in dataclasses.fields(message):

@@ -1,4 +1,4 @@
-"""When a source that goes by time publishes next."""
+"""Says when a source that goes by time publishes its next frame."""
 
 from __future__ import annotations
 
@@ -8,27 +8,28 @@ from collections.abc import Callable
 
 
 class Ticker:
-    """A tick every `period_s` seconds after `start`, without drift; those that a stall has missed are left out."""
+    """A tick every `period_s` seconds after `start`, without drift. Ticks that were missed during a delay are left
+    out."""
 
     def __init__(self, period_s: float, clock: Callable[[], float] = time.monotonic) -> None:
         self._period_s, self._clock = period_s, clock
         self._next_s = math.inf
 
     def start(self) -> None:
-        """The first tick is one period from now."""
+        """Starts. The first tick comes one period from now."""
         self._next_s = self._clock() + self._period_s
 
     def stop(self) -> None:
-        """No more ticks."""
+        """Stops. There are no more ticks."""
         self._next_s = math.inf
 
     @property
     def wait_s(self) -> float:
-        """Seconds to the next tick: infinite before the start, 0 when it is due."""
+        """Seconds until the next tick. Infinite before the start, and 0 if the tick is due."""
         return max(0.0, self._next_s - self._clock())
 
     def take(self) -> bool:
-        """Whether a tick is due; if so it is taken."""
+        """Returns whether a tick is due, and takes it if so."""
         late_s = self._clock() - self._next_s
         if late_s < 0.0:
             return False
