@@ -1,4 +1,5 @@
-"""MCAP files that are no logs of Saccade: told as what they are, before anything is made of them."""
+"""Recognises MCAP files that are not logs of Saccade, so that they are refused with their description before they are
+read."""
 
 from __future__ import annotations
 
@@ -13,13 +14,13 @@ from saccade.shared.errors import SaccadeError, printable
 from saccade.shared.log.recording import AWAITED, CONFIGURATION, KEY, LOG
 from saccade.shared.log.records import DAMAGE, records, summary_of, within
 
-NAMED = 2  # topics that are named one by one
-NAME_LIMIT = 60  # characters of a name that is told
-LOOKED_AT_BYTES = 64 * 1024 * 1024  # of a file that does not say at its end which topics it has
+NAMED = 2  # so many topics are named one by one
+NAME_LIMIT = 60  # characters of a name in the description
+LOOKED_AT_BYTES = 64 * 1024 * 1024  # looked at in a file that does not list its topics at its end
 
 
 def is_key(topic: str) -> bool:
-    """Whether a channel's topic is a key of Saccade's, and one that can be printed."""
+    """Whether the topic of a channel is a key of Saccade's that can be printed."""
     try:
         parse_key(topic)
     except SaccadeError:
@@ -28,8 +29,8 @@ def is_key(topic: str) -> bool:
 
 
 def foreign(path: Path) -> str | None:
-    """What an MCAP file is that holds nothing of Saccade's; None for a log, and for what is too damaged to tell. Raises
-    OSError where it cannot be read."""
+    """Describes an MCAP file that holds nothing of Saccade's. Returns None for a log, and for a file that is too
+    damaged to tell. Raises OSError if the file cannot be read."""
     found = _Found()
     with path.open("rb") as stream:
         whole = found.look_through(stream)
@@ -41,7 +42,7 @@ def foreign(path: Path) -> str | None:
 
 
 def describe(path: Path, profile: str, topics: list[str]) -> str:
-    """In words what a file is that is no log of Saccade."""
+    """Describes in words a file that is not a log of Saccade."""
     what = f" of profile '{printable(profile, NAME_LIMIT)}'" if profile else ""
     names = ", ".join(printable(topic, NAME_LIMIT) for topic in sorted(topics)[:NAMED])
     more = f" (and {len(topics) - NAMED} more)" if len(topics) > NAMED else ""
@@ -50,14 +51,15 @@ def describe(path: Path, profile: str, topics: list[str]) -> str:
 
 
 class _Found:
-    """What a file is seen to hold."""
+    """What was found in a file."""
 
     def __init__(self) -> None:
         self.profile = ""
         self.topics: dict[int, str] = {}
 
     def look_through(self, stream: BinaryIO) -> bool | None:
-        """Whether the file was whole as far as it was looked at; None as soon as there is something of Saccade's."""
+        """Returns whether the file was whole as far as it was looked at. Returns None as soon as something of Saccade's
+        is found."""
         try:
             for record in records(stream, sums=False):
                 if isinstance(record, Header):
@@ -66,7 +68,7 @@ class _Found:
                     self.topics[record.id] = record.topic[:NAME_LIMIT]
                 if _is_ours(record):
                     return None
-                if isinstance(record, Channel):  # one is enough where the end of the file tells the others
+                if isinstance(record, Channel):  # one is enough if the end of the file lists the others
                     break
                 if stream.tell() > LOOKED_AT_BYTES:
                     return True

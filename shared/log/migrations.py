@@ -1,7 +1,7 @@
-"""Logs outlive their format: one small change from each format to the next, oldest first.
+"""Old logs can be read: for each change of the log's format there is one small function, the oldest first.
 
-A change sees a message's fields as they lie in the MessagePack map (arrays are still extension types) and returns them
-as the next format has them.
+A function takes the fields of a message as they are in the MessagePack map (arrays are still extension types). It
+returns them as the next format has them.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from saccade.shared.errors import SaccadeError
 Fields = dict[str, Any]
 Change = Callable[[Topic, str | None, Fields], Fields]
 
-OLDEST = 1  # of logs that do not say
-ADDED = {m.Percept: ("mask_bits",), m.Plan: ("best_eyes_m", "best_g")}  # fields that older logs do not have: None
+OLDEST = 1  # the format of logs that do not name one
+ADDED = {m.Percept: ("mask_bits",), m.Plan: ("best_eyes_m", "best_g")}  # fields that older logs lack; they become None
 
 
 def count_in_episodes() -> Change:
-    """1 to 2: sequence numbers count from 0 in every episode, not through the run."""
+    """Format 1 to 2: sequence numbers count from 0 in every episode, no longer through the whole run."""
     first: dict[tuple[str, str | None, str, int], int] = {}
 
     def change(topic: Topic, part: str | None, fields: Fields) -> Fields:
@@ -38,7 +38,7 @@ def count_in_episodes() -> Change:
 
 
 def with_masks_and_candidates() -> Change:
-    """2 to 3: percepts say where in the image they are from, plans what they were chosen from."""
+    """Format 2 to 3: percepts have a mask of where the object is seen, and plans have their best candidates."""
     def change(topic: Topic, part: str | None, fields: Fields) -> Fields:
         if topic.type not in ADDED:
             return fields
@@ -52,7 +52,7 @@ FORMAT = OLDEST + len(CHANGES)
 
 
 class Migration:
-    """From the format of a log to today's. Raises SaccadeError for a format that is not known yet."""
+    """Brings the messages of a log to the present format. Raises SaccadeError if the format of the log is not known."""
 
     def __init__(self, version: int, path: Path) -> None:
         if not OLDEST <= version <= FORMAT:
@@ -60,7 +60,7 @@ class Migration:
         self._changes = [make() for make in CHANGES[version - OLDEST:]]
 
     def __call__(self, topic: Topic, part: str | None, payload: bytes) -> bytes:
-        """The wire bytes of today's format; what is no message stays as it is."""
+        """Returns the encoded message in the present format. A payload that is not a message stays as it is."""
         if not self._changes:
             return payload
         try:
@@ -69,5 +69,5 @@ class Migration:
             for change in self._changes:
                 fields = change(topic, part, fields)
             return msgpack.packb(fields)
-        except Exception:  # msgpack raises many kinds for bytes that are not msgpack; whoever decodes it says so
+        except Exception:  # msgpack raises many kinds of errors for other bytes; decoding reports them
             return payload

@@ -1,4 +1,4 @@
-"""Which state of the source something was made with."""
+"""The state of the source with which something was made."""
 
 from __future__ import annotations
 
@@ -8,13 +8,16 @@ import subprocess
 from saccade.shared.config import PACKAGE
 
 WRITTEN = ("results", "docs")
-BUILT_FROM = PACKAGE / "COMMIT"  # in a wheel
+BUILT_FROM = PACKAGE / "COMMIT"  # this file is in a wheel
 
 
 def commit() -> str:
-    """The commit of the source, with "-dirty" where it was changed since. Results and documents may change: they are
-    what runs write. A package that was built knows its own; elsewhere it is what SACCADE_COMMIT says, or "unknown"."""
-    if BUILT_FROM.is_file():  # first: an environment may lie in a checkout of something else
+    """Returns the commit of the source, followed by "-dirty" if the source was changed since.
+
+    Changes of results and documents do not count, because runs write them. A package that was built knows its own
+    commit. If there is neither a built package nor a git repository, it is the value of SACCADE_COMMIT, or "unknown".
+    """
+    if BUILT_FROM.is_file():  # first, because the environment may lie in a checkout of another project
         return BUILT_FROM.read_text().strip()
     try:
         head = _git("rev-parse", "HEAD")

@@ -1,4 +1,4 @@
-"""Reading the log of a run, whole or not, of today's format or an older one."""
+"""Reads the log of a run, whole or damaged, in the present format or an older one."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from saccade.shared.log.records import DAMAGE, records, summary_of
 
 NEED = "give the run.mcap of a run"
 ANY_SIZE = 2 ** 63
-MOST_NOTES = 1000  # metadata records: ours have a few
+MOST_NOTES = 1000  # metadata records; a log of Saccade's has a few
 MAX_CONFIGURATION_BYTES = 4 * 1024 * 1024
 
 
@@ -36,10 +36,12 @@ class Recorded(NamedTuple):
 
 
 class RunReader:
-    """Reads a log in the order of arrival, its messages as those of today's format. `cut` says, once it is read, why it
-    ends before its end (None: it is whole); `refused` counts entries that are no valid messages, `others` those under
-    keys that are none of Saccade's; metadata and configuration are there before the first entry. Raises SaccadeError
-    for a file that is no log, or one of a format to come. Without `sums` the checksums are not verified: twice as fast.
+    """Reads a log in the order of arrival. Its messages come in the present format.
+
+    When the log has been read, `cut` says why it ends early; it is None if the log is whole. `refused` counts entries
+    that are not valid messages, and `others` counts entries under keys that are not Saccade's. Metadata and
+    configuration are known before the first entry. Without `sums` the checksums are not verified, which is twice as
+    fast. Raises SaccadeError if the file is not a log, or if its format is newer than this Saccade.
     """
 
     def __init__(self, path: Path, *, sums: bool = True) -> None:
@@ -57,7 +59,7 @@ class RunReader:
                 raise SaccadeError(other)
 
     def __iter__(self) -> Iterator[tuple[Topic, str | None, Message]]:
-        """Every valid message."""
+        """Yields every valid message with its topic and part."""
         for entry in self.entries():
             try:
                 yield entry.topic, entry.part, decode(entry.topic.type, entry.payload)
@@ -65,7 +67,7 @@ class RunReader:
                 self.refused += 1
 
     def entries(self) -> Iterator[Recorded]:
-        """Every entry, valid or not."""
+        """Yields every entry, valid or not."""
         channels: dict[int, tuple[Topic, str | None]] = {}
         migrate = None
         self.cut, self.refused, self.others = None, 0, 0
@@ -81,7 +83,7 @@ class RunReader:
                         yield Recorded(topic, part, migrate(topic, part, record.data), record.log_time)
                     elif isinstance(record, Channel):
                         channels.pop(record.id, None)
-                        if is_key(record.topic):  # else one that someone else added
+                        if is_key(record.topic):  # other channels were added by somebody else
                             self.world, topic, part = parse_key(record.topic)
                             channels[record.id] = topic, part
                     else:
@@ -93,26 +95,26 @@ class RunReader:
             self.cut = f"log {self.path} ended early: {reason}"
 
     def _note(self, record: object) -> None:
-        """What is no message. Raises ValueError where there is more of it than a log has."""
+        """Takes a record that is not a message. Raises ValueError if there are more of them than a log has."""
         if isinstance(record, Attachment) and record.name == CONFIGURATION:
             if len(record.data) > MAX_CONFIGURATION_BYTES:
                 raise ValueError("the configuration is too large")
-            self.configuration = record.data.decode(errors="replace")  # whoever reads it refuses it
+            self.configuration = record.data.decode(errors="replace")  # `recorded` refuses damaged text
         elif isinstance(record, Metadata) and record.name != KEY:
             if len(self.metadata) >= MOST_NOTES and record.name not in self.metadata:
                 raise ValueError("there is too much metadata")
             self.metadata[record.name] = dict(record.metadata)
 
     def require_something(self) -> None:
-        """Raises SaccadeError, once the log is read, where it is damaged from its start on."""
+        """Raises SaccadeError if the log is damaged from its start on. It is called when the log has been read."""
         if self.cut is not None and not self.metadata:
             raise SaccadeError(f"{self.path} holds nothing that can be read: it is damaged from its start on; "
                                "`saccade log recover` looks for what is left")
 
     @property
     def format(self) -> int:
-        """The format that the log was written in; known once its first entry has been read. Raises SaccadeError where
-        it is no number."""
+        """The format in which the log was written. It is known when the first entry has been read. Raises SaccadeError
+        if it is not a number."""
         told = self.metadata.get(LOG, {}).get("format", str(OLDEST))
         if not (told.isascii() and told.isdigit() and len(told) < 10):
             raise SaccadeError(f"log {self.path} says that its format is {told!r}, which is no number")
@@ -120,8 +122,11 @@ class RunReader:
 
 
 def is_whole(path: Path) -> bool:
-    """Whether a log has its end, as a recorder writes it that was told to stop: one that was killed, or had no room,
-    has no index. What a log lacks beside it, `saccade log check` says."""
+    """Whether a log has an end as it is written by a recorder that was told to stop.
+
+    A recorder that was killed, or that ran out of space, leaves a log without an index. `saccade log check` says what
+    else a log may lack.
+    """
     try:
         with path.open("rb") as stream:
             return stream.read(len(MCAP0_MAGIC)) == MCAP0_MAGIC and summary_of(stream) is not None

@@ -1,4 +1,5 @@
-"""Writing the log of a run as MCAP: the wire bytes as they were. A crash loses little of it."""
+"""Writes the log of a run as MCAP. It holds the encoded messages as they were on the bus, and a crash loses little of
+it."""
 
 from __future__ import annotations
 
@@ -23,28 +24,29 @@ from saccade.shared.errors import SaccadeError
 from saccade.shared.log.migrations import FORMAT
 from saccade.shared.log.records import MAX_PAYLOAD_BYTES
 
-FLUSH_S = 0.4  # a chunk is closed this often: what a killed recorder may lose
+FLUSH_S = 0.4  # a chunk is closed this often; a recorder that is killed loses at most this much
 CONFIGURATION = "config.json"
 ENDED_EARLY = "ended_early"
 LOG = "log"  # metadata about the log itself: its format
-CUT = "cut"  # metadata of a log that does not begin with step 0, or is a part of another: which steps it has
-AWAITED = "awaited"  # metadata of the log of a run that says when it is over: that it has to say so
-FINISHED = "finished"  # metadata of the log of a run whose source has said that it is over: how many episodes it had
+CUT = "cut"  # metadata of a log that begins later than step 0, or is a part of another log: its steps
+AWAITED = "awaited"  # metadata of a run's log that must hold FINISHED at its end
+FINISHED = "finished"  # metadata of a run's log whose source has said that it is over: its number of episodes
 RECOVERED = "recovered"  # metadata of a recovered log: from which, and what was lost
-KEY = "key"  # metadata, one of each key: its channel once more, outside of the chunks, should its chunk be damaged
-MOST_KEYS = 4096  # of a log; MCAP has numbers for 65,535
+KEY = "key"  # metadata, one for each key: repeats its channel outside of the chunks, in case its chunk is damaged
+MOST_KEYS = 4096  # in one log; MCAP has numbers for 65,535
 LONGEST_KEY = 256
 
 
 class RecordingStopped(SaccadeError):
-    """The log can take no more; what was recorded stays readable."""
+    """The log cannot take any more. What was recorded so far can be read."""
 
 
 class RunLog:
-    """Writes one run's log. `metadata`: names to maps of text, such as versions and weights' hashes.
+    """Writes the log of one run. `metadata` maps names to maps of text, such as the versions and the hashes of the
+    weights.
 
-    Raises SaccadeError if the file cannot be created or is there already; RecordingStopped, once, when the
-    disk is full or the log was removed.
+    Raises SaccadeError if the file exists or cannot be created. Raises RecordingStopped, once, if the disk is full or
+    the log was removed.
     """
 
     def __init__(self, path: Path, *, world: str, configuration: str = "{}",
@@ -58,14 +60,14 @@ class RunLog:
             self._file = _WholeRecords(path)
         except OSError as error:
             raise SaccadeError(f"log {path} cannot be written: {error.strerror}") from error
-        writer = Writer(self._file)  # type: ignore[arg-type]  # it asks for no more than write, tell and flush
+        writer = Writer(self._file)  # type: ignore[arg-type]  # the Writer only needs write, tell and flush
         self._writer: Writer | None = writer
         self._guarded(self._start, writer, configuration, metadata or {})
 
     def write(self, topic: Topic, part: str | None, payload: bytes, *, sequence: int = 0,
               log_time_ns: int | None = None) -> None:
-        """Appends wire bytes, at the time of their arrival (now unless given). What the log does not take (`refusal`)
-        is left out."""
+        """Appends an encoded message with the time of its arrival, which is now unless given. A message for which
+        `refusal` gives a reason is left out."""
         if self._writer is not None:
             now_ns = time.time_ns() if log_time_ns is None else log_time_ns
             if self.refusal(topic, part, payload) is None:
@@ -73,7 +75,7 @@ class RunLog:
             self.flush_if_due()
 
     def refusal(self, topic: Topic, part: str | None, payload: bytes) -> str | None:
-        """Why the log does not take such a message; None where it does."""
+        """Returns the reason why the log does not take this message, or None if it takes it."""
         key = topic.key(self._world, part)
         if key not in self._channels:
             if len(self._channels) >= MOST_KEYS:
@@ -90,12 +92,12 @@ class RunLog:
             self._guarded(self._writer.add_metadata, name, {k: str(v) for k, v in values.items()})
 
     def flush_if_due(self) -> None:
-        """To be called at least every FLUSH_S seconds while nothing is written."""
+        """Must be called at least every FLUSH_S seconds while nothing is written."""
         if time.monotonic() - self._flushed_s >= FLUSH_S:
             self.flush()
 
     def flush(self) -> None:
-        """Brings to the disk what was written so far."""
+        """Brings everything that was written so far to the disk."""
         if self._writer is not None:
             self._flushed_s = time.monotonic()
             self._guarded(self._writer.flush)
@@ -122,7 +124,8 @@ class RunLog:
                                    "free some space before the next run") from error
 
     def _stop_if_gone(self) -> None:
-        """The file of a removed folder can be written on and on, and is nowhere once it is closed."""
+        """Raises RecordingStopped if the file was removed. One could go on writing into it, but it would be lost once
+        it is closed."""
         if self._file.is_gone():
             self._writer = None
             self._file.close()
@@ -153,11 +156,11 @@ class RunLog:
 
 
 class _WholeRecords:
-    """The file below mcap's Writer, which writes whole records only: of one that does not fit nothing is left."""
+    """The file below mcap's Writer. It keeps whole records only: a record that does not fit leaves nothing behind."""
 
     def __init__(self, path: Path) -> None:
         self._path = path.absolute()
-        self._raw = path.open("xb", buffering=0)  # a log is never written over
+        self._raw = path.open("xb", buffering=0)  # a log is never overwritten
         self._end = 0
 
     def write(self, data: bytes) -> int:
@@ -171,13 +174,13 @@ class _WholeRecords:
         return self._end
 
     def flush(self) -> None:
-        """Nothing is held back."""
+        """Does nothing, because nothing is held back."""
 
     def sync(self) -> None:
         os.fdatasync(self._raw.fileno())
 
     def is_gone(self) -> bool:
-        """Whether it has been removed; one that was moved or has another name is still there."""
+        """Whether the file was removed. A file that was moved or renamed is still there."""
         held = os.fstat(self._raw.fileno())
         with contextlib.suppress(OSError):
             if os.path.samestat(held, os.stat(self._path)):
@@ -185,7 +188,7 @@ class _WholeRecords:
         return held.st_nlink == 0
 
     def end_early(self, reason: str) -> None:
-        """Cuts off a half-written record and, where there is room, ends the file as MCAP asks, without an index."""
+        """Cuts off a half-written record. If there is room, it also ends the file as MCAP demands, without an index."""
         ending = RecordBuilder()
         Metadata(name=ENDED_EARLY, metadata={"reason": reason}).write(ending)
         DataEnd(0).write(ending)
@@ -202,12 +205,14 @@ class _WholeRecords:
 
 
 def key_metadata(channel: int, key: str) -> dict[str, str]:
-    """The metadata KEY of a channel. It has a sum of its own: MCAP has none for what is outside of chunks."""
+    """Returns the metadata KEY of a channel. It has a checksum of its own, because MCAP has none for records outside of
+    chunks."""
     return {"channel": str(channel), "key": key, "crc32": str(zlib.crc32(f"{channel} {key}".encode()))}
 
 
 def channel_of(values: Mapping[str, str]) -> Channel | None:
-    """The channel that the metadata KEY tells of, without its schema; None where it is not as it was written."""
+    """Returns the channel that a metadata KEY describes, without its schema. Returns None if the metadata is not as it
+    was written."""
     channel, key = values.get("channel", ""), values.get("key", "")
     if not channel.isdecimal() or values != key_metadata(int(channel[:6]), key):
         return None
@@ -219,7 +224,8 @@ def channel_of(values: Mapping[str, str]) -> Channel | None:
 
 
 def json_schema(message_type: type[Message]) -> dict[str, Any]:
-    """JSON Schema of a message's MessagePack map. Arrays are extension type 1; their dtype and shape stand beside."""
+    """Returns the JSON Schema of a message's MessagePack map. Arrays are extension type 1; their dtype and shape are
+    given beside it."""
     fields = field_types(message_type)
     properties = {"type": {"const": message_type.__name__}, "version": {"const": message_type.VERSION}}
     properties |= {name: _field_schema(hint) for name, hint in fields.items()}

@@ -1,5 +1,8 @@
-"""The records of an MCAP file one by one. Whatever a file claims, memory is bounded by the limits below, and time by
-what the file and its chunks really hold."""
+"""Reads the records of an MCAP file one by one.
+
+Whatever a file claims, the limits below bound the memory that is used. The time is bounded by what the file and its
+chunks really hold.
+"""
 
 from __future__ import annotations
 
@@ -19,18 +22,19 @@ from mcap.writer import MCAP0_MAGIC
 
 from saccade.shared.bus.wire import MAX_BYTES
 
-MAX_PAYLOAD_BYTES = 2 * MAX_BYTES  # what a log takes: more than any valid message has
-MAX_CHUNK_BYTES = 4 * MAX_BYTES  # of a chunk, once it is decompressed
+MAX_PAYLOAD_BYTES = 2 * MAX_BYTES  # largest payload that a log takes; valid messages are smaller
+MAX_CHUNK_BYTES = 4 * MAX_BYTES  # largest size of a chunk after it is decompressed
 MAX_RECORD_BYTES = 256 * 1024 * 1024
 MAX_ATTACHMENT_BYTES = 64 * 1024 * 1024
-MAX_NOTE_BYTES = 1024 * 1024  # of what becomes many small objects: metadata, channels
-MOST_OPENED_BYTES, MOST_TIMES = 1024 ** 3, 500  # beyond the first, chunks may open to so many times what they take
+MAX_NOTE_BYTES = 1024 * 1024  # largest record that becomes many small objects, such as metadata and channels
+# All chunks together may hold MOST_OPENED_BYTES, or MOST_TIMES their compressed size if that is more.
+MOST_OPENED_BYTES, MOST_TIMES = 1024 ** 3, 500
 
-HEAD = struct.Struct("<BQ")  # of every record: opcode and length
+HEAD = struct.Struct("<BQ")  # head of every record: opcode and length
 MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, time of logging and of publication
 FOOTER_BYTES = HEAD.size + 20
 DAMAGE = (McapError, struct.error, zstandard.ZstdError, ValueError, OverflowError, MemoryError, RuntimeError)
-# the last is what lz4 raises
+# lz4 raises RuntimeError
 
 TYPES: dict[int, Any] = {
     opcode: getattr(mcap, "".join(word.title() for word in opcode.name.split("_"))) for opcode in Opcode}
@@ -39,15 +43,15 @@ WANTED = (Opcode.HEADER, Opcode.CHANNEL, Opcode.ATTACHMENT, Opcode.METADATA)
 
 
 def limit_of(opcode: int) -> int:
-    """How many bytes a record of that kind may have."""
+    """The largest size of a record of this kind, in bytes."""
     if opcode == Opcode.ATTACHMENT:
         return MAX_ATTACHMENT_BYTES
     return MAX_RECORD_BYTES if opcode in LARGE or opcode not in TYPES else MAX_NOTE_BYTES
 
 
 def parse(opcode: int, body: bytes, *, exact: bool = False) -> Any:
-    """The record whose content this is. Raises one of DAMAGE for what is none; with `exact` also where there is more
-    than its fields."""
+    """Returns the record with this content. Raises one of DAMAGE if the content is not such a record, and with `exact`
+    also if it is longer than the fields of the record."""
     if opcode == Opcode.MESSAGE:
         return _message(body, 0, len(body))
     reader = ReadDataStream(BytesIO(body))
@@ -66,13 +70,13 @@ def _message(data: bytes, start: int, end: int) -> mcap.Message:
 
 
 class Opener:
-    """Opens the chunks of one file, and stops where they open to more than a log can hold."""
+    """Opens the chunks of one file. It stops if they become larger than a log can be."""
 
     def __init__(self, *, sums: bool) -> None:
         self._sums, self._taken, self._opened = sums, 0, 0
 
     def data(self, chunk: mcap.Chunk) -> bytes:
-        """What is in a chunk. Raises one of DAMAGE if it is not whole, or too large."""
+        """Returns the data of a chunk. Raises one of DAMAGE if the chunk is not whole, or too large."""
         size = chunk.uncompressed_size
         self._taken, self._opened = self._taken + len(chunk.data), self._opened + size
         if size > MAX_CHUNK_BYTES or self._opened > max(MOST_OPENED_BYTES, MOST_TIMES * self._taken):
@@ -100,7 +104,7 @@ def _decompressed(chunk: mcap.Chunk, size: int) -> bytes:
 
 
 def within(data: bytes, kinds: tuple[int, ...] = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)) -> Iterator[Any]:
-    """The records of these kinds in the data of a chunk. Raises one of DAMAGE where one is not whole."""
+    """Yields the records of these kinds in the data of a chunk. Raises one of DAMAGE if a record is not whole."""
     offset, size = 0, len(data)
     while offset < size:
         opcode, length = HEAD.unpack_from(data, offset)
@@ -118,8 +122,8 @@ def within(data: bytes, kinds: tuple[int, ...] = (Opcode.SCHEMA, Opcode.CHANNEL,
 
 
 def records(stream: BinaryIO, *, sums: bool = True) -> Iterator[Any]:
-    """Header, channels, messages, metadata and attachments of a file from its start to its footer, in its order, those
-    in chunks too. Raises one of DAMAGE where the file is cut or damaged."""
+    """Yields the header, channels, messages, metadata and attachments of a file, in the order of the file, including
+    those in chunks. Raises one of DAMAGE where the file is cut or damaged."""
     opener, size = Opener(sums=sums), os.fstat(stream.fileno()).st_size
     if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
         raise ValueError("no MCAP file")
@@ -144,14 +148,14 @@ def records(stream: BinaryIO, *, sums: bool = True) -> Iterator[Any]:
 
 
 def check_attachment(body: bytes) -> None:
-    """Raises ValueError where an attachment's checksum is not that of its content."""
+    """Raises ValueError if the checksum of an attachment does not fit its content."""
     if zlib.crc32(memoryview(body)[:-4]) != int.from_bytes(body[-4:], "little") != 0:
         raise ValueError("its checksum is not that of its content")
 
 
 def summary_of(stream: BinaryIO) -> bytes | None:
-    """The summary that a finished file has at its end, without its footer; None where there is none, or not as it was
-    written."""
+    """Returns the summary at the end of a finished file, without the footer. Returns None if there is no summary, or if
+    it is not as it was written."""
     size = os.fstat(stream.fileno()).st_size
     end = size - len(MCAP0_MAGIC)
     start = end - FOOTER_BYTES
