@@ -1,4 +1,4 @@
-"""Typed configuration: one object for a run, validated, saved beside its log. An unknown key is an error.
+"""The configuration: one typed object for a run, validated, and saved beside the log. An unknown key is an error.
 
 The text under each key is its description in the guide's reference.
 """
@@ -19,7 +19,7 @@ PRESETS, WEIGHTS = PACKAGE / "shared" / "presets", PACKAGE / "weights"
 
 MAX_FILE_BYTES = 1 * MIB
 MAX_TEXT = 1024  # characters of a value; paths are the longest
-MANY = 1_000_000  # steps, scenes and the like: more would never end
+MANY = 1_000_000  # limit for steps, scenes and the like; more would never end
 _NEED = "give a file of TOML or JSON, or leave it out for the default"
 
 
@@ -29,7 +29,7 @@ class Section(BaseModel):
     @field_validator("*")
     @classmethod
     def _can_be_told(cls, value: Any) -> Any:
-        """Texts go into messages, file names and onto terminals."""
+        """Refuses texts that cannot go into messages, file names and onto a terminal."""
         for text in value if isinstance(value, tuple) else (value,):
             if isinstance(text, str | Path) and not (len(str(text)) <= MAX_TEXT and is_text(str(text))):
                 raise ValueError(f"a text must be Unicode, without control codes, of at most {MAX_TEXT} characters")
@@ -238,13 +238,14 @@ class Config(Section):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The objects of the run. Raises SaccadeError where they are not resolved."""
+        """The objects of the run. Raises SaccadeError if they are not resolved yet."""
         if not self.scene.names:
             raise SaccadeError("configuration key 'scene.names' is empty: the objects of the run are not resolved")
         return self.scene.names
 
     def with_values(self, values: dict[str, Any]) -> Config:
-        """A copy with dotted keys replaced (`{"scene.yaw": "fixed"}`). Raises SaccadeError for an unknown key."""
+        """Returns a copy with dotted keys replaced (`{"scene.yaw": "fixed"}`). Raises SaccadeError if a key is
+        unknown."""
         tree = self.model_dump(mode="json")
         for dotted, value in values.items():
             node: Any = tree
@@ -258,19 +259,19 @@ class Config(Section):
         return validate(tree, "the given values")
 
     def save(self, path: Path) -> None:
-        """Writes the resolved configuration as JSON, which `load` reads back: whole or not at all. Raises SaccadeError
-        where it cannot be written."""
+        """Writes the resolved configuration as JSON, whole or not at all. `load` reads it back. Raises SaccadeError if
+        it cannot be written."""
         with writing(path, "configuration"):
             replace_whole(path, (self.model_dump_json(indent=2) + "\n").encode())
 
 
 def validate(tree: dict[str, Any], where: str) -> Config:
-    """The configuration in a tree. Raises SaccadeError that names the key."""
+    """Returns the configuration in a tree. Raises SaccadeError, which names the wrong key."""
     return checked(Config, tree, f"configuration key {{}} in {where}")
 
 
 def checked(model: type[Checked], tree: dict[str, Any], what: str) -> Checked:
-    """The section in a tree. Raises SaccadeError; in `what` the key stands for {}."""
+    """Returns the section in a tree. Raises SaccadeError, which begins with `what`; the wrong key replaces its {}."""
     try:
         return model.model_validate(tree)
     except ValidationError as error:
@@ -280,7 +281,7 @@ def checked(model: type[Checked], tree: dict[str, Any], what: str) -> Checked:
 
 
 def recorded(text: str | None, where: str) -> Config:
-    """The configuration that a log holds, the default where it holds none. Raises SaccadeError for a damaged one."""
+    """Returns the configuration in a log, or the default if there is none. Raises SaccadeError if it is damaged."""
     if text is not None and len(text) > MAX_FILE_BYTES:
         raise SaccadeError(f"the configuration in {where} is larger than {size_of(MAX_FILE_BYTES)}: give another log")
     try:
@@ -291,7 +292,7 @@ def recorded(text: str | None, where: str) -> Config:
 
 
 def load(path: Path | None) -> Config:
-    """Reads TOML or JSON, or a preset by its name (`default`, `paper`); the default where no path is given."""
+    """Reads TOML or JSON, or a preset by its name (`default`, `paper`). Returns the default if no path is given."""
     if path is None or str(path) == "default":
         return Config()
     if os.path.isfile(PRESETS / f"{path}.toml"):
@@ -305,7 +306,7 @@ def load(path: Path | None) -> Config:
 
 
 def weights_folder(name: str | Path | None) -> Path | None:
-    """A folder of weights, or the one of that name among those that come with Saccade."""
+    """Returns a folder of weights. A name stands for one that comes with Saccade, if no folder here has this name."""
     if not name:
         return None
     path = Path(name)

@@ -1,23 +1,25 @@
-"""The one exception for what the user can mend: what, where, what to do, in one line."""
+"""The exception for everything that the user can repair. Its text says in one line what is wrong, where, and what to
+do."""
 
 from __future__ import annotations
 
 import reprlib
 
-LINE_LIMIT = 2000  # characters of an error: what to do stands at its end and has to be seen
-NAME_LIMIT = 200  # of a name or a value in it
+LINE_LIMIT = 2000  # characters of an error; its end says what to do and must be seen
+NAME_LIMIT = 200  # characters of a name or a value in an error
 
 
 class SaccadeError(Exception):
-    """Bad input or a missing piece of the machine. Printed as one line, exit code 2, never as a traceback."""
+    """The input is wrong, or something is missing on this machine. It is printed as one line without a traceback, with
+    exit code 2."""
 
     def __str__(self) -> str:
         return printable(super().__str__(), LINE_LIMIT)
 
 
 def printable(text: str, limit: int = 400) -> str:
-    """The text as a terminal can show it: control codes, lone surrogates and changes of direction are escaped, and of
-    what is longer than `limit` characters the middle is left out."""
+    """Returns the text as a terminal can show it. Control codes, lone surrogates and changes of direction are escaped.
+    If the text is longer than `limit` characters, its middle is left out."""
     shown = _without_middle(text, limit)
     if not shown.isprintable():
         shown = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in shown)
@@ -29,7 +31,8 @@ def _without_middle(text: str, limit: int) -> str:
 
 
 def is_text(text: str) -> bool:
-    """Whether a text is Unicode and has no control codes: it can go into messages, and does nothing to a terminal."""
+    """Whether a text is valid Unicode without control codes. Such a text can be put into messages and is harmless on a
+    terminal."""
     try:
         text.encode()
     except UnicodeEncodeError:
@@ -38,7 +41,7 @@ def is_text(text: str) -> bool:
 
 
 def told(value: object) -> str:
-    """A value from outside as an error names it: a text in quotes, and of what is long or deep only a part."""
+    """Returns a value from outside as an error names it: a text in quotes, and only a part of what is long or deep."""
     if isinstance(value, str):
         return f"'{printable(value, NAME_LIMIT)}'"
     return printable(reprlib.repr(value), NAME_LIMIT)

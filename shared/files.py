@@ -1,6 +1,7 @@
-"""Files from outside: only regular ones are opened, and only as many bytes as are sane are read of them.
+"""Files from outside. Only regular files are opened, and only a limited number of bytes is read.
 
-A FIFO, a socket or a device could block for ever; a huge or a deep file would fill the memory before it is refused.
+Reading a FIFO, a socket or a device could block for ever. A huge or deeply nested file would fill the memory before it
+is refused.
 """
 
 from __future__ import annotations
@@ -18,9 +19,9 @@ from typing import Any, BinaryIO
 from saccade.shared.errors import SaccadeError, told
 
 MIB = 1024 * 1024
-MAX_DEPTH = 64  # of lists and maps within one another
-MAX_VALUES = 4_000_000  # in one file: so many take some hundred megabytes
-MAX_KEY_PARTS = 32  # of a dotted key in TOML: reading it takes their number squared
+MAX_DEPTH = 64  # levels of lists and maps within one another
+MAX_VALUES = 4_000_000  # in one file; so many take some hundred megabytes
+MAX_KEY_PARTS = 32  # of a dotted key in TOML; the time to read it grows with the square of this
 KINDS = {stat.S_IFDIR: "a folder", stat.S_IFIFO: "a FIFO", stat.S_IFSOCK: "a socket", stat.S_IFCHR: "a device",
          stat.S_IFBLK: "a device"}
 
@@ -29,14 +30,17 @@ _LONG_KEY = re.compile(rf"(?<![A-Za-z0-9_-])(?:{_PART}[ \t]*+\.[ \t]*+){{{MAX_KE
 
 
 def size_of(number: int) -> str:
-    """A size in words."""
+    """Returns a number of bytes in words."""
     return f"{number // MIB} MiB" if number >= MIB else f"{number} bytes"
 
 
 @contextmanager
 def opened(path: Path, what: str, need: str, limit: int) -> Iterator[BinaryIO]:
-    """A regular file of at most `limit` bytes, open for reading; it never blocks. Raises SaccadeError, which begins
-    with `what` and the path and ends with `need`, also where reading fails within the context."""
+    """Opens a regular file of at most `limit` bytes for reading. It never blocks.
+
+    Raises SaccadeError, which begins with `what` and the path and ends with `need`. It does so also if reading fails
+    within the context.
+    """
     with _open(path, what, need, limit) as stream:
         try:
             yield stream
@@ -46,7 +50,7 @@ def opened(path: Path, what: str, need: str, limit: int) -> Iterator[BinaryIO]:
 
 def _open(path: Path, what: str, need: str, limit: int) -> BinaryIO:
     try:
-        _require_regular(os.stat(path), path, what, need)  # first: opening a device may do something
+        _require_regular(os.stat(path), path, what, need)  # before opening, because opening a device may have an effect
         stream = os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb")
     except (OSError, ValueError) as error:  # ValueError: a path that no file can have
         raise SaccadeError(f"{what} {path} cannot be read ({getattr(error, 'strerror', error)}): {need}") from error
@@ -68,16 +72,17 @@ def _require_regular(found: os.stat_result, path: Path, what: str, need: str) ->
 
 
 def read_bytes(path: Path, what: str, need: str, limit: int) -> bytes:
-    """The bytes of a file. Raises SaccadeError as `opened`."""
+    """Returns the bytes of a file. Raises SaccadeError like `opened`."""
     with opened(path, what, need, limit) as stream:
         data = stream.read(limit + 1) or b""
-    if len(data) > limit:  # it grew, or is one that does not tell its size
+    if len(data) > limit:  # it has grown, or it does not tell its size
         raise SaccadeError(f"{what} {path} is larger than {size_of(limit)}: {need}")
     return data
 
 
 def read_text(path: Path, what: str, need: str, limit: int) -> str:
-    """The text of a file in UTF-8, its lines ending in a line feed. Raises SaccadeError as `opened`."""
+    """Returns the text of a file in UTF-8, with line feeds at the ends of its lines. Raises SaccadeError like `opened`,
+    and if it is not UTF-8."""
     try:
         return read_bytes(path, what, need, limit).decode().replace("\r\n", "\n")
     except UnicodeDecodeError as error:
@@ -85,7 +90,8 @@ def read_text(path: Path, what: str, need: str, limit: int) -> str:
 
 
 def parse_json(text: str, *, max_values: int = MAX_VALUES) -> Any:
-    """What a text in JSON holds. Raises ValueError for what is none, too deep, too much, or says a key twice."""
+    """Returns what a text in JSON holds. Raises ValueError if it is not JSON, is nested too deeply, holds too many
+    values, or repeats a key."""
     if text.count(",") + text.count("[") + text.count("{") > max_values:
         raise ValueError(f"it holds more than {max_values} values")
     try:
@@ -97,7 +103,8 @@ def parse_json(text: str, *, max_values: int = MAX_VALUES) -> Any:
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """What a text in TOML holds. Raises ValueError for what is none, too deep, or has an endless key."""
+    """Returns what a text in TOML holds. Raises ValueError if it is not TOML, is nested too deeply, or has a key of too
+    many parts."""
     if _LONG_KEY.search(text):
         raise ValueError(f"a key has more than {MAX_KEY_PARTS} parts")
     try:
@@ -129,7 +136,8 @@ def _require_flat(tree: Any) -> None:
 
 @contextmanager
 def writing(path: Path, what: str) -> Iterator[None]:
-    """Around whatever writes there: a disk that is full, a folder that is read-only and the like raise SaccadeError."""
+    """Is put around code that writes to `path`. Raises SaccadeError if that fails, for example because the disk is full
+    or the folder is read-only."""
     try:
         yield
     except OSError as error:
@@ -138,7 +146,7 @@ def writing(path: Path, what: str) -> Iterator[None]:
 
 
 def append_line(path: Path, line: str) -> None:
-    """Appends a line to a file, whole or not at all. Raises OSError."""
+    """Appends a line to a file, whole or not at all. Raises OSError if that fails."""
     with path.open("ab", buffering=0) as file:
         end = file.seek(0, os.SEEK_END)
         rest = memoryview(f"{line}\n".encode())
@@ -152,12 +160,12 @@ def append_line(path: Path, line: str) -> None:
 
 
 def replace_whole(path: Path, data: bytes) -> None:
-    """Writes a file that is there whole or as it was before. Raises OSError."""
+    """Writes a file. If that fails, the file stays as it was before. Raises OSError."""
     replace_all(path.parent, {path.name: data})
 
 
 def replace_all(folder: Path, contents: Mapping[str, bytes]) -> None:
-    """Writes files of a folder; all of them stay as they were where one cannot be written. Raises OSError."""
+    """Writes several files of a folder. If one of them cannot be written, all stay as they were. Raises OSError."""
     drafts = {folder / name: folder / f"{name}.part" for name in contents}
     try:
         for draft, data in zip(drafts.values(), contents.values(), strict=True):

@@ -32,7 +32,7 @@ EXIT_ERROR = 2
 NOTE_LENGTH = 1000
 REFUSED = "refused: "
 STARTING = "starting"
-HEARTBEAT_VARIABLE = "SACCADE_HEARTBEAT"  # names a file for programs that are not on the bus; it holds the state
+HEARTBEAT_VARIABLE = "SACCADE_HEARTBEAT"  # names a file whose age and text show the state to others
 LAUNCHER_VARIABLE = "SACCADE_LAUNCHER"  # the launcher's process id; the service stops if it loses this parent
 
 Item = tuple[Topic, str | None, bytes]

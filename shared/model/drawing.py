@@ -1,6 +1,7 @@
-"""p(o | p) in NumPy: crops drawn from latent poses, without the networks' library (paper, section 3.2 and table 6).
+"""p(o | p) in NumPy: draws crops from latent poses without PyTorch (paper, section 3.2 and table 6).
 
-The twin of `Decoder` and `PaperDecoder` in `shared/model/generative_model.py`, which training and perception use.
+It computes the same as `Decoder` and `PaperDecoder` in `shared/model/generative_model.py`, which training and
+perception use.
 """
 
 from __future__ import annotations
@@ -19,11 +20,11 @@ Array = NDArray[np.float32]
 Layer = Callable[[Array], Array]
 
 PREFIX = "ccn.decoder."
-START = (64, 8, 8)  # channels, height and width of what the linear layers give
+START = (64, 8, 8)  # channels, height and width of the output of the linear layers
 
 
 class LatentDecoder:
-    """Draws one object. Raises SaccadeError where its weights are not those of a decoder."""
+    """Draws one object. Raises SaccadeError if its weights are missing or damaged, or are not those of a decoder."""
 
     def __init__(self, weights: Weights, name: str) -> None:
         state = weights.state(name, PREFIX)
@@ -35,7 +36,7 @@ class LatentDecoder:
             raise SaccadeError(f"weights {weights.folder / name} are of another architecture: train anew") from error
 
     def __call__(self, latent: Array) -> Array:
-        """A latent mean [L] -> a crop on black [3, 64, 64]."""
+        """Returns the crop on black [3, 64, 64] of a latent mean [L]."""
         x = latent
         for weight, bias, leaky in self._linear:
             x = x @ weight + bias
@@ -84,19 +85,20 @@ def _convolution(state: dict[str, Array], name: str, margin: int = 0) -> Layer:
 
 
 def rectified(x: Array) -> Array:
-    """A leaky rectifier."""
+    """A leaky rectifier, for each number of x."""
     return np.maximum(x, LEAK * x)
 
 
 def shuffled(x: Array) -> Array:
-    """Channels become pixels: [4 C, H, W] -> [C, 2 H, 2 W]."""
+    """Pixel shuffle: turns channels into pixels, [4 C, H, W] -> [C, 2 H, 2 W]."""
     channels, height, width = x.shape
     blocks = x.reshape(channels // 4, 2, 2, height, width).transpose(0, 3, 1, 4, 2)
     return blocks.reshape(channels // 4, 2 * height, 2 * width)
 
 
 def enlarged(x: Array, side: int) -> Array:
-    """Bilinear, pixels' corners kept apart: [C, H, H] -> [C, side, side]."""
+    """Bilinear enlargement [C, H, H] -> [C, side, side]. The corners of the two images coincide, not the centres of
+    their corner pixels."""
     between = _between(x.shape[-1], side)
     rows: Array = between @ x
     return rows @ between.T
@@ -104,7 +106,7 @@ def enlarged(x: Array, side: int) -> Array:
 
 @functools.cache
 def _between(old: int, new: int) -> Array:
-    """The weights [new, old] of the old pixels in the new ones."""
+    """The weights [new, old] of the old pixels in each new one."""
     place = np.clip((np.arange(new) + 0.5) * old / new - 0.5, 0, None)
     low = np.floor(place).astype(np.int64)
     high, share = np.minimum(low + 1, old - 1), place - low

@@ -1,9 +1,10 @@
-"""The cortical column network (CCN): one small generative model per object (paper, section 3.2 and appendix C).
+"""The cortical column network (CCN): one small generative model for each object (paper, section 3.2 and appendix C).
 
-A crop o is encoded into q(p | o), a Gaussian over the object's latent pose; p(p' | p, a) moves it by a displacement in
-azimuth and elevation; p(o | p) draws it. Perception encodes, belief moves (in NumPy: `shared/model/latent.py`),
-training does both: so it lives here.
-There are two architectures: "paper" is the paper's tables to the letter, "default" is what departs from them.
+The encoder turns a crop o into q(p | o), a Gaussian over the latent pose of the object. The transition p(p' | p, a)
+moves the latent pose by a displacement in azimuth and elevation. The decoder p(o | p) draws the crop. Perception uses
+the encoder, belief uses the transition (in NumPy: `shared/model/latent.py`), and training uses all of them.
+
+There are two architectures: "paper" follows the paper's tables exactly, and "default" is Saccade's own.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ LATENT = 8
 
 
 def conv_stack(channels_in: int, width: int) -> nn.Sequential:
-    """Four 4x4 convolutions of stride 2 (tables 5 and 4): [B, C, 64, 64] -> [B, 256 width]."""
+    """Four 4x4 convolutions of stride 2 (paper, tables 4 and 5): [B, C, 64, 64] -> [B, 256 width]."""
     layers: list[nn.Module] = []
     for channels in (8, 16, 32, 64):
         layers += [nn.Conv2d(channels_in, channels * width, 4, stride=2), nn.LeakyReLU()]
@@ -31,14 +32,16 @@ def conv_stack(channels_in: int, width: int) -> nn.Sequential:
 
 
 def gaussian(parameters: Tensor) -> tuple[Tensor, Tensor]:
-    """[..., 2 L] -> mean [..., L] and standard deviation [..., L] > 0."""
+    """Splits parameters [..., 2 L] into a mean [..., L] and a standard deviation [..., L] > 0."""
     mean, raw = parameters.chunk(2, dim=-1)
     return mean, F.softplus(raw) + MIN_STD
 
 
 class Encoder(nn.Module):
-    """q(p | o): masked crop and its mask [B, 4, 64, 64] -> mean, std [B, L] (table 5; the paper's is of width 1 and
-    sees the masked crop alone)."""
+    """q(p | o): masked crop and its mask [B, 4, 64, 64] -> mean and standard deviation [B, L] (paper, table 5).
+
+    The paper's encoder has width 1 and sees the masked crop only.
+    """
 
     def __init__(self, width: int = 2, channels_in: int = 4):
         super().__init__()
@@ -50,9 +53,11 @@ class Encoder(nn.Module):
 
 
 class Transition(nn.Module):
-    """p(p' | p, a): latent [B, L], displacement (azimuth, elevation) [B, 2] in radians -> mean, std [B, L] (table 7).
+    """p(p' | p, a): latent pose [B, L] and displacement (azimuth, elevation) [B, 2] in radians -> mean and standard
+    deviation [B, L] (paper, table 7).
 
-    The azimuth enters as sine and cosine, so that a full turn is no turn; or, not `periodic`, as it is (the paper's).
+    If `periodic`, the azimuth enters as sine and cosine, so that a full turn changes nothing. Otherwise it enters as an
+    angle, as in the paper.
     """
 
     def __init__(self, periodic: bool = True):
@@ -70,8 +75,11 @@ class Transition(nn.Module):
 
 
 class Decoder(nn.Module):
-    """p(o | p): latent [B, L] -> crop on black [B, 3, 64, 64]. Pixel shuffle instead of the paper's wide 5x5
-    convolutions (table 6): 4.5 times faster on a CPU, the same quality."""
+    """p(o | p): latent pose [B, L] -> crop on black [B, 3, 64, 64].
+
+    It uses pixel shuffle instead of the paper's wide 5x5 convolutions (table 6). This is 4.5 times faster on a CPU,
+    with the same quality.
+    """
 
     def __init__(self):
         super().__init__()
@@ -87,8 +95,10 @@ class Decoder(nn.Module):
 
 
 class PaperDecoder(nn.Module):
-    """p(o | p) of the paper (table 6): latent [B, L] -> crop on black [B, 3, 64, 64]. No padding: 8 pixels become 4, 17
-    become 13, 35 become 30, 69 become 64."""
+    """p(o | p) of the paper (table 6): latent pose [B, L] -> crop on black [B, 3, 64, 64].
+
+    Without padding, the convolutions shrink the image: 8 pixels become 4, 17 become 13, 35 become 30, and 69 become 64.
+    """
 
     def __init__(self):
         super().__init__()
@@ -104,17 +114,17 @@ class PaperDecoder(nn.Module):
 
 
 def encoder_of(architecture: Architecture) -> Encoder:
-    """An untrained q(p | o)."""
+    """Returns an untrained q(p | o)."""
     return Encoder(width=1, channels_in=3) if architecture == "paper" else Encoder()
 
 
 def transition_of(architecture: Architecture) -> Transition:
-    """An untrained p(p' | p, a)."""
+    """Returns an untrained p(p' | p, a)."""
     return Transition(periodic=architecture == "default")
 
 
 def decoder_of(architecture: Architecture) -> Decoder | PaperDecoder:
-    """An untrained p(o | p)."""
+    """Returns an untrained p(o | p)."""
     return PaperDecoder() if architecture == "paper" else Decoder()
 
 
@@ -128,7 +138,8 @@ class CCN(nn.Module):
 
 
 class Stacked:
-    """K networks of one shape, one per object, evaluated together: inputs and outputs carry K in front."""
+    """Evaluates K networks of the same shape together, one for each object. Inputs and outputs have K as their first
+    dimension."""
 
     def __init__(self, modules: Sequence[nn.Module]):
         self.parameters, self.buffers = stack_module_state([module.eval() for module in modules])
@@ -142,7 +153,7 @@ class Stacked:
 
     @torch.inference_mode()
     def one_by_one(self, *inputs: Tensor):
-        """The slow twin: the same in a loop (for the parity test and the benchmark)."""
+        """Computes the same in a slow loop, for the parity test and the benchmark."""
         results = [module(*(x[k] for x in inputs)) for k, module in enumerate(self._modules)]
         if isinstance(results[0], tuple):
             return tuple(torch.stack(parts) for parts in zip(*results, strict=True))
@@ -150,12 +161,12 @@ class Stacked:
 
 
 def log_density(x: Tensor, mean: Tensor, std: Tensor) -> Tensor:
-    """log N(x; mean, std) of diagonal Gaussians, summed over the last axis."""
+    """log N(x; mean, std) of diagonal Gaussians [..., L], summed over the last axis."""
     return (-0.5 * ((x - mean) / std) ** 2 - std.log() - 0.9189385332046727).sum(-1)
 
 
 def kl_divergence(mean_q: Tensor, std_q: Tensor, mean_p: Tensor | float, std_p: Tensor | float) -> Tensor:
-    """KL[q || p] of diagonal Gaussians, summed over the last axis."""
+    """KL[q || p] of diagonal Gaussians [..., L] in nats, summed over the last axis."""
     mean_p, std_p = torch.as_tensor(mean_p), torch.as_tensor(std_p)
     ratio = std_q / std_p
     return (0.5 * (ratio ** 2 + ((mean_q - mean_p) / std_p) ** 2 - 1.0) - ratio.log()).sum(-1)

@@ -1,6 +1,7 @@
-"""Latent poses in NumPy: what belief needs of a CCN without its networks' library (paper, section 3.2 and table 7).
+"""Latent poses in NumPy: the parts of a CCN that belief needs, without PyTorch (paper, section 3.2 and table 7).
 
-The twin of `Transition`, `log_density` and `kl_divergence` in `shared/model/generative_model.py`, which training uses.
+It computes the same as `Transition`, `log_density` and `kl_divergence` in `shared/model/generative_model.py`, which
+training uses.
 """
 
 from __future__ import annotations
@@ -16,14 +17,15 @@ from saccade.shared.model.weights import Weights
 Array = NDArray[np.float32]
 Gaussian = tuple[Array, Array]  # mean and standard deviation [..., L]
 
-LEAK = 0.01  # of a leaky rectifier
+LEAK = 0.01  # slope of a leaky rectifier below 0
 MIN_STD = 1e-3
 LAYERS = (0, 2, 4, 6)
 PREFIX = "ccn.transition."
 
 
 class LatentTransition:
-    """p(p' | p, a) of one object. Raises SaccadeError where its weights are not those of a transition."""
+    """p(p' | p, a) of one object. Raises SaccadeError if its weights are missing or damaged, or are not those of a
+    transition."""
 
     def __init__(self, weights: Weights, name: str):
         state, self.periodic = weights.state(name, PREFIX), weights.architecture == "default"
@@ -39,7 +41,8 @@ class LatentTransition:
             raise SaccadeError(f"weights {weights.folder / name} are of another architecture: train anew")
 
     def __call__(self, latent: Array, displacement: NDArray[np.float64]) -> Gaussian:
-        """A latent mean [L], displacements (azimuth, elevation) [B, 2] in radians -> mean, std [B, L]."""
+        """Moves a latent mean [L] by displacements (azimuth, elevation) [B, 2] in radians. Returns mean and standard
+        deviation [B, L]."""
         moved = displacement.astype(np.float32)
         if self.periodic:
             moved = np.concatenate([np.sin(moved[:, :1]), np.cos(moved[:, :1]), moved[:, 1:]], axis=1)
@@ -54,11 +57,11 @@ class LatentTransition:
 
 
 def log_density(x: Array, mean: Array, std: Array) -> Array:
-    """log N(x; mean, std) of diagonal Gaussians, summed over the last axis."""
+    """log N(x; mean, std) of diagonal Gaussians [..., L], summed over the last axis."""
     return (-0.5 * ((x - mean) / std) ** 2 - np.log(std) - 0.9189385332046727).sum(-1)
 
 
 def kl_divergence(q: Gaussian, p: tuple[Array | float, Array | float]) -> Array:
-    """KL[q || p] of diagonal Gaussians, summed over the last axis."""
+    """KL[q || p] of diagonal Gaussians [..., L] in nats, summed over the last axis."""
     ratio = q[1] / p[1]
     return (0.5 * (ratio ** 2 + ((q[0] - p[0]) / p[1]) ** 2 - 1.0) - np.log(ratio)).sum(-1)

@@ -1,7 +1,8 @@
-"""Trained weights: a folder of safetensors in half precision with a manifest that is verified on loading.
+"""Trained weights: a folder of safetensors files in half precision, with a manifest that is verified on loading.
 
-`manifest.json` says what the weights are (data, seed, steps, losses, commit, where trained), of which architecture (the
-default one where it says nothing), the measures of each object and the SHA-256 of every file.
+`manifest.json` says how the weights were made (data, seed, steps, losses, commit, where they were trained) and which
+architecture they have (the default one if it names none). It also holds the measures of each object and the SHA-256 of
+every file.
 """
 
 from __future__ import annotations
@@ -36,7 +37,8 @@ _NEED = "get them again or train anew"
 
 @dataclass(frozen=True)
 class ObjectCard:
-    """What the agent knows of an object beside its networks: the box (metres) and the side of its crop (metres)."""
+    """What the agent knows of an object besides its networks: the size of its box [3] and the side of its crop, in
+    metres."""
 
     name: str
     size_m: NDArray[np.float64]
@@ -44,12 +46,13 @@ class ObjectCard:
 
     @property
     def radius_m(self) -> float:
-        """Half the diagonal of the box."""
+        """Half the diagonal of the box, in metres."""
         return float(np.linalg.norm(self.size_m)) / 2
 
 
 class Weights:
-    """The weights in a folder. Raises SaccadeError where the manifest is missing, damaged or does not match."""
+    """The weights in a folder. Raises SaccadeError if the manifest is missing or damaged, or names an unknown
+    architecture."""
 
     def __init__(self, folder: Path):
         self.folder = folder
@@ -72,11 +75,11 @@ class Weights:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Objects that these weights know."""
+        """The objects that these weights know."""
         return tuple(card.name for card in self.cards)
 
     def cards_of(self, names: tuple[str, ...]) -> tuple[ObjectCard, ...]:
-        """Cards in the order of `names`; raises SaccadeError for an object that has no weights."""
+        """Returns the cards in the order of `names`. Raises SaccadeError if an object has no weights."""
         known = {card.name: card for card in self.cards}
         for name in names:
             if name not in known:
@@ -84,8 +87,11 @@ class Weights:
         return tuple(known[name] for name in names)
 
     def state(self, stem: str, prefix: str = "") -> dict[str, NDArray[np.float32]]:
-        """Those arrays of `<stem>.safetensors` whose names begin with `prefix`, without it, after the file's hash was
-        checked."""
+        """Returns the arrays of `<stem>.safetensors` whose names begin with `prefix`, by their names without it.
+
+        The hash of the file is checked first. Raises SaccadeError if the file is missing or damaged, or if its hash is
+        wrong.
+        """
         path = self.folder / f"{stem}.safetensors"
         if not os.path.isfile(path):
             raise SaccadeError(f"weights {path} are missing: {_NEED}")
@@ -94,12 +100,13 @@ class Weights:
             raise SaccadeError(f"weights {path} do not match the hash in {MANIFEST}: get them again or train anew")
         try:
             return {key.removeprefix(prefix): array for key, array in _arrays(data).items() if key.startswith(prefix)}
-        except (SafetensorError, ValueError, KeyError, TypeError) as error:  # those that have the right hash, too
+        except (SafetensorError, ValueError, KeyError, TypeError) as error:  # even if the hash is right
             raise SaccadeError(f"weights {path} are damaged ({error}): {_NEED}") from error
 
     def fill(self, module: nn.Module, stem: str, prefix: str = "") -> nn.Module:
-        """Loads `state(stem, prefix)` into a torch module and returns it."""
-        import torch  # here: belief and planner need the cards and arrays alone
+        """Loads `state(stem, prefix)` into a PyTorch module and returns the module in evaluation mode. Raises
+        SaccadeError like `state`, and if the arrays do not fit the module."""
+        import torch  # here, because belief and planner only need cards and arrays
 
         try:
             module.load_state_dict({key: torch.from_numpy(array) for key, array in self.state(stem, prefix).items()})
@@ -109,7 +116,8 @@ class Weights:
 
 
 def _arrays(data: bytes) -> dict[str, NDArray[np.float32]]:
-    """The arrays of a safetensors file in single precision. Raises ValueError and what safetensors raises."""
+    """Returns the arrays of a safetensors file in single precision. Raises ValueError, or what safetensors raises, if
+    it is not valid."""
     if int.from_bytes(data[:8], "little") > MAX_HEADER_BYTES:
         raise ValueError("its header is longer than any of ours")
     arrays = {}
@@ -145,8 +153,8 @@ def _file_name(name: str) -> str:
 
 def write_weights(folder: Path, states: Mapping[str, Mapping[str, ArrayLike]], cards: tuple[ObjectCard, ...],
                   facts: dict[str, Any]) -> None:
-    """Writes the states in half precision and the manifest with their hashes. Raises SaccadeError where that fails: the
-    weights that were there before then stay."""
+    """Writes the states in half precision, and the manifest with their hashes. Raises SaccadeError if this fails;
+    weights that were there before then stay as they were."""
     files = {f"{stem}.safetensors": save({key: np.asarray(value).astype(np.float16, order="C")
                                           for key, value in state.items()}) for stem, state in states.items()}
     hashes = {name: hashlib.sha256(data).hexdigest() for name, data in files.items()}

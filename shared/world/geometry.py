@@ -1,7 +1,8 @@
 """Camera geometry: pinhole projection, look-at poses, spherical viewpoints.
 
-Conventions, everywhere: metres and radians; right-handed world, z up, table top at z = 0; OpenGL camera (looks along
-its -z, +x right, +y up); pixels are (u, v) = (column, row) of the 480x480 image; `a_from_b` maps points of b to a.
+These conventions hold everywhere. Lengths are in metres and angles in radians. The world is right-handed, z points up,
+and the table top is at z = 0. The camera follows OpenGL: it looks along its -z axis, +x is right and +y is up. Pixels
+are (u, v) = (column, row) of the 480x480 image. `a_from_b` maps points of b to a.
 """
 
 from __future__ import annotations
@@ -12,22 +13,22 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 
 IMAGE_SIZE_PX = 480
-# RealSense D435i at 640x480, cropped to the central 480x480: cx moves by 80 (the published agent forgot to).
+# RealSense D435i at 640x480, cropped to the central 480x480, so cx moves by 80 (not so in the published agent).
 INTRINSICS_PX = (615.132, 615.221, 326.285 - 80.0, 231.780)  # fx, fy, cx, cy
 REFERENCE_RANGE_M = 0.40  # scale 1: the range at which the object views of the paper's dataset are taken
 
 
 def unit(vectors: ArrayLike) -> Array:
-    """Vectors [..., 3] scaled to length 1; a zero vector stays zero."""
+    """Scales vectors [..., 3] to length 1. A zero vector stays zero."""
     vectors = np.asarray(vectors, dtype=np.float64)
     norm = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return vectors / np.where(norm == 0.0, 1.0, norm)
 
 
 def rotation_towards(forward: ArrayLike) -> Array:
-    """Rotations world_from_camera [..., 3, 3] without roll whose -z is `forward` [..., 3].
+    """Rotations world_from_camera [..., 3, 3] without roll, whose -z axis is `forward` [..., 3].
 
-    Straight up or down, where "no roll" says nothing, the image's top points to world +x.
+    Straight up or down, roll is not defined. There the top of the image points to world +x.
     """
     back = -unit(forward)
     right = np.cross(np.array([0.0, 0.0, 1.0]), back)
@@ -47,13 +48,14 @@ def pose(rotation: ArrayLike, position: ArrayLike) -> Array:
 
 
 def look_at(position: ArrayLike, target: ArrayLike) -> Array:
-    """world_from_camera [..., 4, 4] at `position` [..., 3] looking at `target` [..., 3], without roll."""
+    """Poses world_from_camera [..., 4, 4] at `position` [..., 3] that look at `target` [..., 3], without roll
+    (metres)."""
     position = np.asarray(position, dtype=np.float64)
     return pose(rotation_towards(np.asarray(target) - position), position)
 
 
 def direction(azimuth: ArrayLike, elevation: ArrayLike) -> Array:
-    """Unit vectors [..., 3] from a centre towards (azimuth, elevation), radians."""
+    """Unit vectors [..., 3] from a centre towards (azimuth, elevation), in radians."""
     azimuth, elevation = np.asarray(azimuth), np.asarray(elevation)
     return np.stack([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth),
                      np.sin(elevation) + 0.0 * azimuth], axis=-1)
@@ -68,18 +70,19 @@ def spherical(position: ArrayLike, center: ArrayLike) -> tuple[Array, Array, Arr
 
 
 def wrap(angle: ArrayLike) -> Array:
-    """Angles brought into [-pi, pi)."""
+    """Angles in radians, brought into [-pi, pi)."""
     return (np.asarray(angle, dtype=np.float64) + np.pi) % (2 * np.pi) - np.pi
 
 
 def rotation_angle(a: ArrayLike, b: ArrayLike) -> Array:
-    """Angle (radians) of the rotation between rotations a and b [..., 3, 3]."""
+    """Angle [...] in radians of the rotation between the rotations a and b [..., 3, 3]."""
     trace = np.einsum("...ij,...ij->...", np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64))
     return np.arccos(np.clip((trace - 1.0) / 2.0, -1.0, 1.0))
 
 
 def pixel_rays(pixels: ArrayLike, intrinsics: ArrayLike) -> Array:
-    """Unit rays [..., 3] in the camera frame through pixels (u, v) [..., 2]."""
+    """Unit rays [..., 3] in the camera's frame through the pixels (u, v) [..., 2]. `intrinsics` are (fx, fy, cx, cy) in
+    pixels."""
     fx, fy, cx, cy = np.asarray(intrinsics, dtype=np.float64)
     pixels = np.asarray(pixels, dtype=np.float64)
     x, y = (pixels[..., 0] - cx) / fx, -(pixels[..., 1] - cy) / fy
@@ -87,9 +90,10 @@ def pixel_rays(pixels: ArrayLike, intrinsics: ArrayLike) -> Array:
 
 
 def project(points: ArrayLike, world_from_camera: ArrayLike, intrinsics: ArrayLike) -> tuple[Array, Array]:
-    """Pixels (u, v) [..., 2] and depths along the optical axis [...] (metres) of world points [..., 3].
+    """Pixels (u, v) [..., 2] and depths along the optical axis [...] in metres of world points [..., 3].
 
-    Points behind the camera have a depth <= 0 and pixels that mean nothing.
+    `intrinsics` are (fx, fy, cx, cy) in pixels. A point behind the camera has a depth <= 0, and its pixel has no
+    meaning.
     """
     fx, fy, cx, cy = np.asarray(intrinsics, dtype=np.float64)
     camera = np.asarray(world_from_camera, dtype=np.float64)
@@ -100,7 +104,7 @@ def project(points: ArrayLike, world_from_camera: ArrayLike, intrinsics: ArrayLi
 
 
 def euler_xyz(rotation: ArrayLike) -> Array:
-    """Angles (x, y, z) [3] with rotation = Rz(z) Ry(y) Rx(x), for rotation [3, 3]."""
+    """Angles (x, y, z) [3] in radians with rotation = Rz(z) Ry(y) Rx(x), for a rotation [3, 3]."""
     r = np.asarray(rotation, dtype=np.float64)
     y = np.arcsin(np.clip(-r[2, 0], -1.0, 1.0))
     if abs(r[2, 0]) > 1.0 - 1e-12:  # gimbal lock: put everything in z
@@ -109,7 +113,7 @@ def euler_xyz(rotation: ArrayLike) -> Array:
 
 
 def rotation_xyz(angles: ArrayLike) -> Array:
-    """Rz(z) Ry(y) Rx(x) [3, 3] of angles (x, y, z) [3], radians, about the fixed axes."""
+    """The rotation Rz(z) Ry(y) Rx(x) [3, 3] of angles (x, y, z) [3] in radians, about the fixed axes."""
     (cx, cy, cz), (sx, sy, sz) = np.cos(np.asarray(angles)), np.sin(np.asarray(angles))
     rx = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
     ry = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
@@ -118,7 +122,8 @@ def rotation_xyz(angles: ArrayLike) -> Array:
 
 
 def fibonacci_hemisphere(count: int) -> tuple[Array, Array]:
-    """`count` (azimuth, elevation) pairs spread evenly over the upper hemisphere (paper, appendix B)."""
+    """`count` pairs (azimuth, elevation) in radians, each [count], spread evenly over the upper hemisphere (paper,
+    appendix B)."""
     index = np.arange(count) + 0.5
     return wrap(index * np.pi * (3.0 - np.sqrt(5.0))), np.arcsin(1.0 - index / count)
 
@@ -127,6 +132,6 @@ GRID_ELEVATIONS, GRID_AZIMUTHS = 18, 72  # cells of 5 degrees
 
 
 def viewing_grid() -> tuple[Array, Array]:
-    """Centres of the cells on the upper viewing hemisphere: elevation [E] and azimuth [A], radians."""
+    """Centres of the grid's cells on the upper viewing hemisphere: elevations [E] and azimuths [A], in radians."""
     return ((np.arange(GRID_ELEVATIONS) + 0.5) * np.pi / 2 / GRID_ELEVATIONS,
             (np.arange(GRID_AZIMUTHS) + 0.5) * 2 * np.pi / GRID_AZIMUTHS - np.pi)

@@ -1,4 +1,5 @@
-"""Images that a user gives: whole PNG or JPEG files in RGB; what is not is refused in one line."""
+"""Reads images that a user gives: whole PNG or JPEG files in RGB. Other files are refused with a message of one
+line."""
 
 from __future__ import annotations
 
@@ -18,23 +19,24 @@ from saccade.shared.world.geometry import IMAGE_SIZE_PX
 Size = tuple[int, int]  # width and height in pixels
 
 MAX_FILE_BYTES = 128 * MIB
-MAX_PIXELS = 64 * MIB  # such as 8192x8192: decoded they take three times as many bytes
+MAX_PIXELS = 64 * MIB  # such as 8192x8192; decoded, an image takes three times as many bytes
 
 _NEED = "give a PNG or JPEG in RGB"
-_FIRST_TURNED = 5  # of the EXIF orientations that exchange width and height
+_FIRST_TURNED = 5  # from this EXIF orientation on, width and height are exchanged
 
 
 def read_image(path: Path, *, what: str = "image", need: str = _NEED) -> NDArray[np.uint8]:
-    """The image [H, W, 3]; a JPEG upright as its EXIF orientation says.
+    """Returns the image [H, W, 3] of uint8. A JPEG is turned upright as its EXIF orientation says.
 
-    Raises SaccadeError, which begins with `what` and ends with `need`, unless it is a whole PNG or JPEG in RGB.
+    Raises SaccadeError, which begins with `what` and ends with `need`, if the file is not a whole PNG or JPEG in RGB.
     """
     with _opened_rgb(path, what, need) as image:
         return np.array(ImageOps.exif_transpose(image) if image.format == "JPEG" else image)
 
 
 def image_size(path: Path, *, what: str = "image", need: str = _NEED) -> Size:
-    """Width and height (pixels) of the upright image, from its header alone. Raises SaccadeError as `read_image`."""
+    """Returns width and height in pixels of the upright image, from its header alone. Raises SaccadeError like
+    `read_image`."""
     with _opened_rgb(path, what, need) as image:
         if image.format == "JPEG" and image.getexif().get(ExifTags.Base.Orientation, 1) >= _FIRST_TURNED:
             return image.size[::-1]
@@ -42,7 +44,8 @@ def image_size(path: Path, *, what: str = "image", need: str = _NEED) -> Size:
 
 
 def read_goal_image(path: Path) -> NDArray[np.uint8]:
-    """The user's goal image [480, 480, 3]. Raises SaccadeError unless it is a whole PNG or JPEG in RGB of that size."""
+    """Returns the user's goal image [480, 480, 3] of uint8. Raises SaccadeError if it is not a whole PNG or JPEG in RGB
+    of that size."""
     need = f"give a PNG or JPEG of {IMAGE_SIZE_PX}x{IMAGE_SIZE_PX} pixels in RGB"
     width, height = image_size(path, what="goal image", need=need)
     if (width, height) != (IMAGE_SIZE_PX, IMAGE_SIZE_PX):
@@ -52,7 +55,7 @@ def read_goal_image(path: Path) -> NDArray[np.uint8]:
 
 @contextmanager
 def _opened_rgb(path: Path, what: str, need: str) -> Iterator[Image.Image]:
-    """As `opened_image`, of an image in RGB alone."""
+    """Does the same as `opened_image`, but accepts images in RGB only."""
     with opened_image(path, what, need) as image:
         if image.mode != "RGB":
             raise SaccadeError(f"{what} {path} has mode {image.mode}, not RGB: {need}")
@@ -61,10 +64,10 @@ def _opened_rgb(path: Path, what: str, need: str) -> Iterator[Image.Image]:
 
 @contextmanager
 def opened_image(path: Path, what: str, need: str) -> Iterator[Image.Image]:
-    """A PNG or JPEG of any mode, of which the header was read. Raises SaccadeError for another and for one that is too
-    large, also where reading its pixels fails within the context."""
+    """Opens a PNG or JPEG of any mode and reads its header. Raises SaccadeError if it is another kind of file or too
+    large, and also if reading its pixels fails within the context."""
     with opened(path, what, need, MAX_FILE_BYTES) as stream, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of broken EXIF data, which does no harm
+        warnings.simplefilter("ignore")  # broken EXIF data does no harm
         warnings.simplefilter("error", Image.DecompressionBombWarning)
         try:
             with Image.open(stream, formats=("PNG", "JPEG")) as image:
@@ -76,5 +79,5 @@ def opened_image(path: Path, what: str, need: str) -> Iterator[Image.Image]:
             raise
         except UnidentifiedImageError as error:
             raise SaccadeError(f"{what} {path} is neither PNG nor JPEG: {need}") from error
-        except Exception as error:  # Pillow raises many kinds for what is damaged, a bomb, or has endless texts in it
+        except Exception as error:  # Pillow raises many kinds for images that are damaged or made to harm
             raise SaccadeError(f"{what} {path} cannot be read ({error or type(error).__name__}): {need}") from error

@@ -1,6 +1,7 @@
-"""The task's rules (paper, section 4.1): where the camera starts and may go, what an action does, what success is.
+"""The rules of the task (paper, section 4.1): where the camera starts and may go, what an action does, and what success
+is.
 
-Pure functions of poses: no rendering, so that simulator, evaluator, planner and training share one definition.
+These are functions of poses without rendering. So simulator, evaluator, planner and training share one definition.
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ MAX_STEPS = 350
 ACTION_LIMIT = 0.5  # metres and radians, each component
 LOWER_M = np.array([-0.5, -0.5, 0.1])  # the workspace of the camera
 UPPER_M = np.array([0.5, 0.5, 0.6])
-CLEARANCE_M = 0.06  # beyond half the diagonal of an object's box
-GOAL_CLEARANCE_M = 0.05  # the same for the nearest goals; the clearance above then pushes them out
+CLEARANCE_M = 0.06  # a sphere's radius is half the diagonal of the object's box plus this
+GOAL_CLEARANCE_M = 0.05  # the same for the nearest goals, which the clearance above then pushes out
 SUCCESS_TRANSLATION_M = 0.075
 SUCCESS_ROTATION_RAD = 0.5
 START_ELEVATION_RAD, START_RANGE_M = np.pi / 4, 0.65
@@ -27,34 +28,37 @@ TOLERANCE_M = 1e-9
 
 @dataclass(frozen=True)
 class Spheres:
-    """What `clip` pushes the camera out of: centres [N, 3] and radii [N], metres."""
+    """The spheres that `clip` pushes the camera out of: centres [N, 3] and radii [N], in metres."""
 
     centers_m: Array
     radii_m: Array
 
     def depth_m(self, position: ArrayLike) -> float:
-        """How deep a position [3] is inside the worst sphere; at most 0 outside all of them."""
+        """How deep a position [3] is inside the sphere in which it is deepest, in metres. At most 0 if it is outside
+        all spheres."""
         if len(self.radii_m) == 0:
             return 0.0
         return float((self.radii_m - np.linalg.norm(self.centers_m - np.asarray(position), axis=1)).max())
 
 
 def spheres_around(centers_m: ArrayLike, sizes_m: ArrayLike) -> Spheres:
-    """Spheres around objects with box centres [N, 3] and box extents [N, 3], metres."""
+    """The spheres around objects with box centres [N, 3] and box sizes [N, 3], in metres."""
     radii = np.linalg.norm(np.asarray(sizes_m, dtype=np.float64).reshape(-1, 3), axis=1) / 2 + CLEARANCE_M
     return Spheres(np.asarray(centers_m, dtype=np.float64).reshape(-1, 3), radii)
 
 
 def start_pose() -> Array:
-    """world_from_camera [4, 4] at the beginning of every episode: azimuth 0, looking at the table's centre."""
+    """Pose world_from_camera [4, 4] at the beginning of every episode: at azimuth 0, looking at the centre of the
+    table."""
     return look_at(START_RANGE_M * direction(0.0, START_ELEVATION_RAD), np.zeros(3))
 
 
 def clip(position: ArrayLike, spheres: Spheres) -> Array:
-    """What stands for each position [..., 3]: pushed radially out of one sphere after another, then into the workspace.
+    """Returns the allowed position for each position [..., 3] (metres): it is pushed radially out of one sphere after
+    another, and then into the workspace.
 
-    One pass, as in the benchmark: its published goals are clipped so, and a few lie inside a sphere because a later
-    sphere moved them there. Under a stricter rule no agent could get to all of them.
+    This is done once, as in the benchmark. The benchmark's goals were clipped in the same way, and a few of them lie
+    inside a sphere because a later sphere moved them there. With a stricter rule no agent could reach all of them.
     """
     result = np.asarray(position, dtype=np.float64)
     for center, radius in zip(spheres.centers_m, spheres.radii_m, strict=True):
@@ -66,9 +70,10 @@ def clip(position: ArrayLike, spheres: Spheres) -> Array:
 
 
 def apply_action(world_from_camera: ArrayLike, translation_m: ArrayLike, rotation_rad: ArrayLike) -> Array:
-    """The camera pose [4, 4] after an action, before `clip`: moved by translation [3], turned about the world's axes.
+    """Returns the camera pose [4, 4] after an action, before `clip`. The camera is moved by `translation_m` [3] and
+    turned by the angles `rotation_rad` [3], both along the axes of the world.
 
-    Components beyond the action space are brought back into it; the rotation is made orthonormal again.
+    Components that exceed the limit of 0.5 are reduced to it. The rotation is made orthonormal again.
     """
     before = np.asarray(world_from_camera, dtype=np.float64)
     turn = rotation_xyz(np.clip(rotation_rad, -ACTION_LIMIT, ACTION_LIMIT))
@@ -80,14 +85,16 @@ def apply_action(world_from_camera: ArrayLike, translation_m: ArrayLike, rotatio
 
 
 def success(world_from_camera: ArrayLike, goal_world_from_camera: ArrayLike) -> bool:
-    """Whether a camera pose is within both tolerances of the goal pose."""
+    """Whether a camera pose [4, 4] is within both tolerances of the goal pose [4, 4]: 7.5 cm and 0.5 rad (paper,
+    section 4.1)."""
     camera, goal = np.asarray(world_from_camera), np.asarray(goal_world_from_camera)
     near = np.linalg.norm(camera[:3, 3] - goal[:3, 3]) < SUCCESS_TRANSLATION_M
     return bool(near and rotation_angle(camera[:3, :3], goal[:3, :3]) < SUCCESS_ROTATION_RAD)
 
 
 def errors(position: ArrayLike, goal_position: ArrayLike, target_center: ArrayLike) -> tuple[float, float, float]:
-    """(|azimuth| rad, |elevation| rad, |range| m) between two camera positions [3], seen from the target's centre."""
+    """Returns (|azimuth| rad, |elevation| rad, |range| m) between two camera positions [3], as seen from the centre of
+    the target [3]."""
     azimuth, elevation, distance = spherical(position, target_center)
     goal_azimuth, goal_elevation, goal_distance = spherical(goal_position, target_center)
     return (float(abs(wrap(azimuth - goal_azimuth))), float(abs(elevation - goal_elevation)),
@@ -95,9 +102,11 @@ def errors(position: ArrayLike, goal_position: ArrayLike, target_center: ArrayLi
 
 
 class Episode:
-    """The camera's way through one scene, by the rules. Without a goal to judge by (`judged=False`) none succeeds.
+    """The way of the camera through one scene, by the rules of the task.
 
-    It ends at the goal, as in the paper, or with `until="declared"` when the agent first says that it is there.
+    The episode ends when the camera is at the goal, as in the paper. With `until="declared"` it ends when the agent
+    first says that it is there. Both also end after `max_steps`. With `judged=False` there is no goal to judge by, and
+    no episode succeeds.
     """
 
     def __init__(self, goal_world_from_camera: ArrayLike, spheres: Spheres, *, max_steps: int = MAX_STEPS,
@@ -113,7 +122,8 @@ class Episode:
         return camera
 
     def act(self, translation_m: ArrayLike, rotation_rad: ArrayLike, *, arrived: bool = False) -> None:
-        """Moves. `arrived`: the agent says that with this move it is there; judged once, the first time."""
+        """Moves the camera. With `arrived` the agent says that it is there with this move. Only the first such claim is
+        judged."""
         self.camera = self._allowed(apply_action(self.camera, translation_m, rotation_rad))
         self.step += 1
         self.reached |= self.success
@@ -122,10 +132,11 @@ class Episode:
 
     @property
     def success(self) -> bool:
-        """Whether the camera is at the goal now; judged after every action, so never at the start."""
+        """Whether the camera is at the goal now. This is judged after every action, so it is never true at the
+        start."""
         return self.judged and self.step > 0 and success(self.camera, self.goal)
 
     @property
     def done(self) -> bool:
-        """Whether the episode is over: at the goal (or declared to be), or out of steps."""
+        """Whether the episode is over: the camera is at the goal (or the agent has said so), or no steps are left."""
         return (self.reached if self.until == "reached" else self.declared) or self.step >= self.max_steps
