@@ -1,7 +1,7 @@
 """Saccade: an active-vision agent made of independent services.
 
-`saccade.run(objects="pantry", seed=4)` runs it, `saccade.open(path)` reads the log of a run, and `saccade.Agent` is an
-agent within this process, for a robot or a simulator of your own.
+`saccade.run(objects="pantry", seed=4)` runs the agent. `saccade.open(path)` reads the log of a run. `saccade.Agent` is
+an agent within this process, for a robot or a simulator of your own.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ _HOMES = {
 
 
 def __getattr__(name: str) -> Any:
-    """Loads what is asked for: a service's process imports this package too, and needs none of it."""
+    """Loads a name when it is asked for. The process of a service also imports this package, and needs none of these
+    names."""
     if name == "__version__":
         from importlib.metadata import version
 

@@ -1,5 +1,5 @@
-"""What pyproject.toml cannot say: the repository's root is the package `saccade`, its rooms are derived from the
-folders, and a distribution carries the commit that it was built from."""
+"""What pyproject.toml cannot express. The root of the repository is the package `saccade`, its subpackages are found
+from the folders, and a distribution carries the commit that it was built from."""
 
 import os
 import shutil
@@ -11,7 +11,7 @@ from setuptools.command.build_py import build_py
 from setuptools.command.sdist import sdist
 
 ROOMS = ("app", "deploy", "services", "shared", "training")
-COMMIT = Path("COMMIT")  # in an sdist, which has no history
+COMMIT = Path("COMMIT")  # this file is in an sdist, which has no git history
 
 
 def commit() -> str:
@@ -27,11 +27,12 @@ def commit() -> str:
 class BuildWithCommit(build_py):
     def run(self) -> None:
         if not self.editable_mode:
-            shutil.rmtree(self.build_lib, ignore_errors=True)  # or modules that are gone would be packed
+            shutil.rmtree(self.build_lib, ignore_errors=True)  # otherwise modules that were removed would be packed
         super().run()
         if not self.editable_mode:
             target = Path(self.build_lib, "saccade", COMMIT)
-            target.parent.mkdir(parents=True, exist_ok=True)  # an image installs the dependencies before there is code
+            # the folder may be missing: a container image installs the dependencies before the code is there
+            target.parent.mkdir(parents=True, exist_ok=True)
             target.write_text(commit() + "\n")
 
     def find_package_modules(self, package: str, package_dir: str) -> list[tuple[str, str, str]]:

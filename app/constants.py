@@ -14,7 +14,7 @@ MODULES = ("services.belief.core", "services.belief.pose", "services.belief.posi
            "services.planner.free_energy")
 SECTIONS: dict[str, type[Section]] = {"belief": BeliefConfig, "planner": PlannerConfig}
 KINDS = ("chosen", "derived", "measured", "from the")  # a constant's comment begins with one of these
-# Not listed: a number of the paper, and one for the viewer only
+# These are not listed: one is a number of the paper, the other is for the viewer only
 SHOWN = ("planner.step_m", "belief.published_particles")
 PROBABILITIES = {"BORN_VAGUE", "SURE", "DETECTED", "USED_VIEW", "belief.present_above", "planner.goal_confidence",
                  "belief.resample_below", "belief.view_worth", "belief.missed_weight"}

@@ -1,4 +1,5 @@
-"""Whether a log is complete: gaps in the sequence numbers, steps without one of their topics, damage."""
+"""Checks whether a log is complete. It finds gaps in the sequence numbers, steps without one of their topics, and
+damage."""
 
 from __future__ import annotations
 
@@ -19,13 +20,13 @@ from saccade.shared.errors import printable
 from saccade.shared.log.reading import RunReader
 from saccade.shared.log.recording import AWAITED, FINISHED
 
-MOST_STRETCHES = 6  # of steps that are named one by one
-MOST_ABSENT = 10_000  # stretches that are looked for: each costs memory, and the steps of a log may be any numbers
+MOST_STRETCHES = 6  # stretches of steps that are named one by one
+MOST_ABSENT = 10_000  # stretches that are looked for; each costs memory, and steps may have any numbers
 LINE_LIMIT = 400
 
 
 class Absent(NamedTuple):
-    """Steps of an episode without a message of one key, from `first` to `last`."""
+    """The steps of an episode, from `first` to `last`, in which a key has no message."""
 
     run: str
     episode: int
@@ -36,11 +37,14 @@ class Absent(NamedTuple):
 
 @dataclass
 class Missing:
-    """What a log lacks. `lost`: messages per key, by sequence number; `heartbeats`, of which nobody keeps a copy, apart
-    from them and no reason to call a log incomplete. `absent`: topics that every step should have, by stretches of
-    steps, the first MOST_ABSENT. `repeated`: messages that are there twice. `unfinished`: how far a run came that was
-    not brought to its end. `episodes`: stretches of whole episodes that are not there. `cut`: why the file is not
-    whole."""
+    """What a log lacks.
+
+    `lost`: messages that are missing by their sequence numbers, for each key. `heartbeats`: missing status messages;
+    nobody keeps a copy of them, so they do not make a log incomplete. `absent`: stretches of steps without a topic that
+    every step should have, the first MOST_ABSENT of them. `repeated`: messages that are there twice. `refused`: entries
+    that are not valid messages. `unfinished`: how far the run came, if it was not finished. `episodes`: stretches of
+    whole episodes that are missing. `cut`: why the file is not whole.
+    """
 
     messages: int = 0
     repeated: int = 0
@@ -54,17 +58,17 @@ class Missing:
 
     @property
     def count(self) -> int:
-        """How many messages are missing."""
+        """The number of messages that are missing."""
         return sum(self.lost.values()) + sum(stretch.last - stretch.first + 1 for stretch in self.absent)
 
     @property
     def complete(self) -> bool:
-        """There is something, and nothing is missing."""
+        """Whether the log holds messages, and nothing is missing."""
         return self.messages > 0 and not (self.lost or self.absent or self.repeated or self.refused or self.episodes
                                           or self.unfinished or self.cut)
 
     def lines(self) -> Iterator[str]:
-        """What is missing, a line each."""
+        """Yields one line for each thing that is missing."""
         yield from (printable(line, LINE_LIMIT) for line in self._lines())
 
     def _lines(self) -> Iterator[str]:
@@ -90,9 +94,12 @@ class Missing:
 
 
 def missing(path: Path) -> Missing:
-    """Reads a log and reports gaps. The last step of an episode that is done needs no answer to its frame; of a log
-    that was cut out of another only its range is expected. Where nobody waited (`bus.live`) no step needs an answer.
-    Raises SaccadeError for a file that is no log, or damaged from its start on."""
+    """Reads a log and returns what it lacks.
+
+    The last step of an episode needs no answer to its frame. If the log was cut out of another one, only the steps of
+    its range are expected. In live mode (`bus.live`) no step needs an answer. Raises SaccadeError if the file is not a
+    log, or if it is damaged from its start on.
+    """
     report, reader, sequences, there = Missing(), RunReader(path), None, There()
     for topic, part, message in reader:
         sequences = sequences or Sequences(from_start=True, cut=range_of(reader) is not None)
@@ -116,7 +123,8 @@ def missing(path: Path) -> Missing:
 
 
 class There:
-    """What is there of each episode: of each key the steps, what holds for all of it, and where it was done."""
+    """What a log holds of each episode: the steps of each key, the latched messages, and the step at which it was
+    done."""
 
     def __init__(self) -> None:
         self.steps: dict[tuple[str, int], dict[str, set[int]]] = defaultdict(lambda: defaultdict(set))
@@ -124,7 +132,7 @@ class There:
         self.done: dict[tuple[str, int], set[int]] = defaultdict(set)
 
     def take(self, topic: Topic, key: str, message: Message | Stamp) -> None:
-        """Notes a message, of which the stamp is enough unless it is a Truth."""
+        """Notes a message. Its stamp is enough, unless it is a Truth."""
         at = message.run, message.episode
         if topic.latched:
             self.held[at].add(key)
@@ -134,7 +142,8 @@ class There:
                 self.done[at].add(message.step)
 
     def absent(self, kept: Range | None) -> Iterator[Absent]:
-        """Of each episode and key the steps that are not there, as stretches: there may be more than can be counted."""
+        """Yields the steps that are missing for each episode and key, as stretches, because there may be too many to
+        count."""
         keys = sorted(set().union(*(of_key for of_key in self.steps.values())))
         for episode, of_key in self.steps.items():
             first, last = 0, max(max(steps) for steps in of_key.values())
@@ -145,7 +154,8 @@ class There:
                     yield Absent(*episode, key, *stretch)
 
     def not_held(self, result: str) -> Iterator[Absent]:
-        """What one episode has and another lacks; only one that is over has a result."""
+        """Yields the latched messages that one episode has and another lacks. Only an episode that is over has a
+        result."""
         keys = set().union(*self.held.values())
         for episode in self.steps:
             for key in keys - self.held.get(episode, set()):
@@ -154,7 +164,8 @@ class There:
 
 
 def _unfinished(reader: RunReader, there: There) -> tuple[str | None, list[tuple[int, int]]]:
-    """How far a run came that was not brought to its end, and which whole episodes are not there of one that was."""
+    """Returns how far the run came if it was not finished. If it was finished, returns which whole episodes are
+    missing."""
     found = {episode for _, episode in there.steps}
     if FINISHED not in reader.metadata:
         last = max(found, default=None)
@@ -167,7 +178,7 @@ def _unfinished(reader: RunReader, there: There) -> tuple[str | None, list[tuple
 
 
 def between(numbers: set[int], first: int, last: int) -> Iterator[tuple[int, int]]:
-    """The stretches from `first` to `last` that have none of the numbers, each by its own first and last."""
+    """Yields the stretches from `first` to `last` that hold none of the numbers, each as its first and last number."""
     due = first
     for number in sorted(numbers):
         if number > last:
@@ -180,12 +191,12 @@ def between(numbers: set[int], first: int, last: int) -> Iterator[tuple[int, int
 
 
 def abbreviated(numbers: Iterable[int]) -> str:
-    """Ascending numbers as stretches: 1-3, 7, 9-12."""
+    """Returns ascending numbers as text, joined to stretches: 1-3, 7, 9-12."""
     return in_stretches([(number, number) for number in numbers])
 
 
 def in_stretches(stretches: Iterable[tuple[int, int]]) -> str:
-    """Ascending stretches in words, those that follow each other as one: 1-3, 7, 9-12."""
+    """Returns ascending stretches as text. Stretches that follow each other directly are joined: 1-3, 7, 9-12."""
     joined: list[tuple[int, int]] = []
     for first, last in stretches:
         if joined and first == joined[-1][1] + 1:

@@ -1,4 +1,4 @@
-"""Some steps of an episode out of a log, as a log of their own."""
+"""Cuts some steps of an episode out of a log, as a log of their own."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ from saccade.shared.errors import SaccadeError
 from saccade.shared.log.reading import Recorded, RunReader
 from saccade.shared.log.recording import AWAITED, CUT, ENDED_EARLY, FINISHED, LOG, RecordingStopped, RunLog
 
-NOT_OF_A_PART = (LOG, ENDED_EARLY, AWAITED, FINISHED)  # metadata that speaks of the whole log
+NOT_OF_A_PART = (LOG, ENDED_EARLY, AWAITED, FINISHED)  # metadata about the whole log
 
 
 @dataclass(frozen=True)
 class Range:
-    """Steps of an episode (None: of every one), `end` included (None: up to the last)."""
+    """Some steps of an episode, from `start` to `end` inclusive. `episode` is None for every episode, `end` is None for
+    the last step."""
 
     episode: int | None
     start: int
@@ -28,8 +29,8 @@ class Range:
 
 
 def range_of(reader: RunReader) -> Range | None:
-    """Which steps a log was cut to, or recorded from; None for a whole one. Known once its first entry has been read.
-    Raises SaccadeError where the log does not say it."""
+    """The steps to which a log was cut, or from which it was recorded. None for a whole log. It is known when the first
+    entry has been read. Raises SaccadeError if the log was cut but does not say to which steps."""
     told = reader.metadata.get(CUT)
     if not told:
         return None
@@ -41,10 +42,11 @@ def range_of(reader: RunReader) -> Range | None:
 
 
 def cut(log: Path, out: Path, *, episode: int | None = None, start: int = 0, end: int | None = None) -> Range:
-    """Writes the messages of these steps of an episode (the last) into the new log `out`, in today's format, and says
-    which they are. With them go the latched messages up to then, and each service's status of that time.
+    """Writes the messages of these steps of an episode (by default the last one) into the new log `out`, in the present
+    format. Returns the steps.
 
-    Raises SaccadeError if nothing is left, `log` cannot be read, or `out` is there already or cannot be written.
+    The new log also holds the latched messages up to then, and the status messages of that time. Raises SaccadeError if
+    nothing is left, if `log` cannot be read, or if `out` exists or cannot be written.
     """
     kept, times = _find(log, episode, start, end)
     reader, target = RunReader(log), None
@@ -68,8 +70,9 @@ def cut(log: Path, out: Path, *, episode: int | None = None, start: int = 0, end
 
 
 def _find(log: Path, episode: int | None, start: int, end: int | None) -> tuple[Range, tuple[int, int]]:
-    """What there is of the steps asked for, and from when to when it was recorded (ns)."""
-    there: dict[int, dict[int, tuple[int, int]]] = {}  # by episode and step: the first and last time
+    """Returns which of the given steps the log holds, and the times (ns) between which they were recorded. Raises
+    SaccadeError if it holds none."""
+    there: dict[int, dict[int, tuple[int, int]]] = {}  # by episode and step: first and last time
     reader = RunReader(log)
     for entry in reader.entries():
         if entry.topic.in_step and not entry.topic.latched:
@@ -96,7 +99,7 @@ def _find(log: Path, episode: int | None, start: int, end: int | None) -> tuple[
 
 
 def _kept(entry: Recorded, kept: Range, times: tuple[int, int]) -> int | None:
-    """The sequence number of an entry that belongs to the cut; None of one that does not."""
+    """Returns the sequence number of an entry that belongs to the cut, and None for any other entry."""
     try:
         message = decode(entry.topic.type, entry.payload)
     except MessageError:

@@ -1,4 +1,4 @@
-"""A log as episodes of steps, for whoever reads runs from Python: `for episode in log: for step in episode`."""
+"""Reads a log in Python as episodes of steps: `for episode in log: for step in episode`."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from saccade.shared.config import Config, recorded
 from saccade.shared.errors import SaccadeError
 from saccade.shared.log.reading import RunReader
 
-WINDOW = 64  # steps that are kept open: a recorder that was restarted logs what it missed later
+WINDOW = 64  # steps that are kept open, because a recorder that was restarted logs late what it missed
 
 Entries = dict[tuple[Topic, str | None], bytes]
 
 
 class _Messages:
-    """Messages of one step or one episode, decoded when they are asked for. One that is no valid message counts as
-    missing."""
+    """The messages of one step or one episode, which are decoded when they are asked for. A message that is not valid
+    counts as missing."""
 
     def __init__(self) -> None:
         self._entries: Entries = {}
@@ -59,7 +59,7 @@ class _Messages:
 
 
 class Step(_Messages):
-    """Everything that was said about one step. What the log lacks is None, or missing from the mapping."""
+    """All messages of one step. A message that the log lacks is None, or missing from the mapping."""
 
     def __init__(self, number: int) -> None:
         super().__init__()
@@ -72,12 +72,12 @@ class Step(_Messages):
 
     @cached_property
     def percepts(self) -> Mapping[str, Percept]:
-        """What each object's networks made of the frame, by the object's name."""
+        """The percept of each object in the frame, by the object's name."""
         return self._by_part(PERCEPT)
 
     @cached_property
     def beliefs(self) -> Mapping[str, Belief]:
-        """What is believed about each object after the frame, by the object's name."""
+        """The belief about each object after the frame, by the object's name."""
         return self._by_part(BELIEF)
 
     @property
@@ -92,7 +92,7 @@ class Step(_Messages):
 
     @property
     def truth(self) -> Truth | None:
-        """The simulator's ground truth; a real camera has none."""
+        """The simulator's ground truth. A real camera has none."""
         return self._get(TRUTH)
 
     def __repr__(self) -> str:
@@ -100,14 +100,15 @@ class Step(_Messages):
 
 
 class Episode(_Messages):
-    """One episode. Iterating gives its steps in order, once."""
+    """One episode. Iterating yields its steps in order, once."""
 
     def __init__(self, number: int, steps: Iterator[Step]) -> None:
         super().__init__()
         self.number, self._steps = number, steps
 
     def __iter__(self) -> Iterator[Step]:
-        """Raises SaccadeError where the log has gone on to the next episode and steps of this one were not read."""
+        """Yields the steps. Raises SaccadeError if the log was read on to the next episode before all steps of this one
+        were read."""
         return self._steps
 
     def _pass_over(self) -> None:
@@ -117,17 +118,17 @@ class Episode(_Messages):
 
     @property
     def goal(self) -> Goal | None:
-        """The image that the agent was to reach; known from the first step on."""
+        """The image that the agent had to reach. It is known from the first step on."""
         return self._get(GOAL)
 
     @cached_property
     def goal_percepts(self) -> Mapping[str, Percept]:
-        """What each object's networks made of the goal image; known from the first step on."""
+        """The percept of each object in the goal image, by the object's name. They are known from the first step on."""
         return self._by_part(GOAL_PERCEPT)
 
     @property
     def result(self) -> Result | None:
-        """How the episode ended; known when its steps have been read."""
+        """How the episode ended. This reads the steps that were not read yet."""
         for _ in self._steps:
             pass
         return self._get(RESULT)
@@ -137,19 +138,19 @@ class Episode(_Messages):
 
 
 class Log:
-    """A run's log. Iterating reads the file once, from its start, and gives its episodes in order. An episode has to be
-    read before the next one is asked for."""
+    """The log of a run. Iterating reads the file once, from its start, and yields its episodes in order. An episode
+    must be read before the next one is asked for."""
 
     def __init__(self, path: str | Path) -> None:
-        """`path`: the folder of a run, or its log. Raises SaccadeError for what is no log."""
+        """`path` is the folder of a run, or its log. Raises SaccadeError if it is not a log."""
         self.path = log_of(Path(path))
         self._reader = RunReader(self.path)
 
     @cached_property
     def config(self) -> Config:
-        """The run's resolved configuration. Raises SaccadeError where the log holds none."""
+        """The resolved configuration of the run. Raises SaccadeError if the log holds none."""
         if self._reader.configuration is None:
-            next(RunReader.entries(self._reader), None)  # it stands before the first message
+            next(RunReader.entries(self._reader), None)  # it comes before the first message
         if self._reader.configuration is None:
             raise SaccadeError(f"log {self.path} holds no configuration")
         return recorded(self._reader.configuration, f"the log {self.path}")
@@ -164,7 +165,7 @@ class Log:
         while (number := entries.episode) is not None:
             episode = Episode(number, iter(()))
             steps = _steps(entries, episode)
-            first = next(steps, None)  # with it the goal is known
+            first = next(steps, None)  # when it is read, the goal is known
             episode._steps = _chain(first, steps)
             yield episode
             episode._pass_over()
@@ -174,7 +175,7 @@ class Log:
 
 
 class _Entries:
-    """The entries of a log, with a look at the next one."""
+    """The entries of a log, of which the next one can be looked at."""
 
     def __init__(self, path: Path) -> None:
         self._entries = RunReader(path).entries()
@@ -183,12 +184,12 @@ class _Entries:
 
     @property
     def episode(self) -> int | None:
-        """That of the next entry; None at the end."""
+        """The episode of the next entry. None at the end."""
         return self.next[3].episode if self.next else None
 
     def advance(self) -> None:
-        """Passes the next entry. What has no stamp is no message, a status belongs to no step, and what comes when the
-        next episode has begun is too late."""
+        """Goes on to the next entry. An entry without a stamp is left out because it is not a message, and a status
+        because it belongs to no step. A message of an episode is too late when the next episode has begun."""
         last, self.next = self.next, None
         for entry in self._entries:
             if entry.topic == STATUS:
@@ -203,7 +204,7 @@ class _Entries:
 
 
 def _steps(entries: _Entries, episode: Episode) -> Iterator[Step]:
-    """The steps of an episode in order; its latched messages go to the episode itself."""
+    """Yields the steps of an episode in order. The latched messages go to the episode itself."""
     waiting: dict[int, Step] = {}
     given = -1
     while entries.next is not None and entries.episode == episode.number:

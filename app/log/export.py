@@ -1,4 +1,4 @@
-"""A run's log for other tools: as MCAP that Foxglove and Rerun show, and as tables."""
+"""Exports the log of a run for other tools: as MCAP that Foxglove and Rerun can show, and as tables."""
 
 from __future__ import annotations
 
@@ -16,12 +16,13 @@ VALUES = "/values"
 
 
 def export_foxglove(log: Path, out: Path, *, console: Console | None = None) -> dict[str, int]:
-    """Writes a run's log as MCAP of Foxglove's messages, at the log's times, and says how many are on each topic.
+    """Writes a run's log as MCAP of Foxglove's messages, with the times of the log. Returns the number of messages on
+    each topic.
 
-    `/camera/...`, `/goal/...`, `/belief/<object>/...`, `/plan/...` and `/truth/...` are to be looked at; the numbers of
-    every message stand on `/values/<topic>[/<part>]`, to be plotted. A log that was cut is exported up to there, which
-    is said on `console` (standard error, unless given) and in the file. Raises SaccadeError if `log` is no log, `out`
-    is there already or cannot be written, or a package is missing.
+    The topics `/camera/...`, `/goal/...`, `/belief/<object>/...`, `/plan/...` and `/truth/...` can be looked at. The
+    numbers of every message are on `/values/<topic>[/<part>]` and can be plotted. A log that was cut is exported up to
+    the cut; this is said on `console` (by default standard error) and in the file. Raises SaccadeError if `log` is not
+    a log, if `out` exists or cannot be written, or if a package is missing.
     """
     with extra():
         from saccade.app.log.foxglove import Scene
@@ -47,8 +48,11 @@ def export_foxglove(log: Path, out: Path, *, console: Console | None = None) -> 
 
 
 def export_tables(log: Path, folder: Path, *, console: Console | None = None) -> list[Path]:
-    """Writes `<topic>.parquet` into a new folder for every topic of a run's log, a row for each message, and returns
-    the files. Says what is missing, and raises SaccadeError, as `export_foxglove` does."""
+    """Writes `<topic>.parquet` into a new folder for every topic of a run's log, with a row for each message. Returns
+    the files.
+
+    It says what is missing, and raises SaccadeError, in the same way as `export_foxglove`.
+    """
     with extra():
         from saccade.app.log.tables import Table
 
@@ -67,7 +71,7 @@ def export_tables(log: Path, folder: Path, *, console: Console | None = None) ->
 
 
 class FoxgloveFile:
-    """An MCAP file of messages that tell their schema and encode themselves: Foxglove's own, and `Values`."""
+    """An MCAP file of messages that know their schema and encode themselves: Foxglove's own messages, and `Values`."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self.counts: dict[str, int] = {}
@@ -77,7 +81,7 @@ class FoxgloveFile:
         self._channels: dict[str, int] = {}
 
     def write(self, topic: str, message: Any, time_ns: int) -> None:
-        """Appends a message; the first of a topic opens its channel."""
+        """Appends a message. The first message of a topic opens its channel."""
         if topic not in self._channels:
             schema = message.get_schema()
             if schema.name not in self._schemas:
@@ -88,12 +92,12 @@ class FoxgloveFile:
         self.counts[topic] = sequence + 1
 
     def attach(self, name: str, text: str | None, time_ns: int) -> None:
-        """A file within the file, where there is one."""
+        """Attaches a text as a file, if there is one."""
         if text is not None:
             self._writer.add_attachment(time_ns, time_ns, name, "application/json", text.encode())
 
     def close(self, metadata: dict[str, dict[str, str]]) -> None:
-        """Writes names and values that are no messages, and the index."""
+        """Writes the metadata and the index."""
         for name, values in metadata.items():
             self._writer.add_metadata(name, values)
         self._writer.finish()

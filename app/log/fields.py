@@ -1,4 +1,4 @@
-"""What the fields of a message hold, read off its dataclass: what every export derives its columns from."""
+"""What the fields of a message hold, according to its dataclass. All exports derive their columns from this."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from typing import Annotated, Any
 
 from saccade.shared.bus.messages import ArraySpec, Message, field_types
 
-IMAGE = "u1"  # the dtype of images, and of nothing else
+IMAGE = "u1"  # the dtype of images; nothing else has it
 
 
 def kinds(message_type: type[Message]) -> dict[str, Any]:
-    """Every field and what it holds, absent or not: an ArraySpec, or one of str, int, float, bool, list[str]."""
+    """Every field and what it holds if it is not absent: an ArraySpec, or one of str, int, float, bool, list[str]."""
     return {name: _kind(hint) for name, hint in field_types(message_type).items()}
 
 
 def fixed_numbers(spec: ArraySpec) -> int | None:
-    """How many numbers an array always has; None where a dimension is free."""
+    """How many numbers an array always has. None if one of its dimensions can have any length."""
     sides = [side for side in spec.shape if not isinstance(side, str)]
     return math.prod(sides) if len(sides) == len(spec.shape) else None
 

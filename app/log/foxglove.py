@@ -1,8 +1,10 @@
-"""A run as Foxglove's messages: what the camera saw, where it was and went, what was believed, planned and true.
+"""Shows a run as Foxglove's messages: what the camera saw and where it was, what was believed and planned, and the
+truth.
 
-Frames: `world` as everywhere, and a frame for each camera as Foxglove and Rerun want it, its optical one: along +z it
-looks, +x is right, +y down; ours looks along -z and has +y up. Both viewers draw all there is but the SceneUpdates
-(labels, ellipsoids, the path as a line): those are Foxglove's alone, and beside names tell nothing that is not drawn.
+Frames: `world` is the same as everywhere. Each camera has an optical frame, as Foxglove and Rerun expect it: it looks
+along +z, +x is right and +y is down. Saccade's own camera looks along -z, and +y is up. Both viewers draw everything
+except the SceneUpdates (labels, ellipsoids, the path as a line). Only Foxglove draws those; apart from names they show
+nothing that is not drawn in another way.
 """
 
 from __future__ import annotations
@@ -24,11 +26,11 @@ from saccade.shared.bus.topics import BELIEF, FRAME, GOAL, PLAN, TRUTH, Topic
 Told = tuple[str, Any]  # a topic and a message for it
 
 WORLD, CAMERA, GOAL_CAMERA, VIEWPOINT = "world", "camera_optical", "goal_optical", "viewpoint_optical"
-NOWHERE = ""  # a frame without a way to the world would keep Rerun from drawing the others together
+NOWHERE = ""  # if a frame had no transform to the world, Rerun would not draw the others together
 CAMERA_FROM_OPTICAL = np.diag([1.0, -1.0, -1.0, 1.0])
-MOST_VIEWS = 2000  # of the path: each message holds all of it, so that it is there wherever one looks in the log
+MOST_VIEWS = 2000  # of the path; each message holds all of it, so that it can be seen at any time of the log
 TRUE, PATH = (0.9, 0.1, 0.9), (0.6, 0.6, 0.6)  # on dark and on light ground
-LABEL_M, MARK_M, YAW_M = 0.03, 0.02, 0.08  # sizes: letters, a true centre's mark, the arrow along its yaw
+LABEL_M, MARK_M, YAW_M = 0.03, 0.02, 0.08  # sizes of letters, of the mark of a true centre, of the arrow along its yaw
 
 POINT = np.dtype([("xyz", "<f4", 3), ("rgba", "u1", 4)])
 _FLOAT, _BYTE = fm.PackedElementFieldNumericType.Float32, fm.PackedElementFieldNumericType.Uint8
@@ -38,7 +40,8 @@ POINT_FIELDS = [*(fm.PackedElementField(name=name, offset=4 * i, type=_FLOAT) fo
 
 
 class Scene:
-    """Takes a log's messages in their order. `goal_view_is_known`: the truth's goal pose is that of the goal image."""
+    """Takes the messages of a log in their order. `goal_view_is_known`: the goal's pose in the truth is that of the
+    goal image."""
 
     def __init__(self, *, goal_view_is_known: bool) -> None:
         self.goal_view_is_known = goal_view_is_known
@@ -48,10 +51,10 @@ class Scene:
         self._ways: dict[int, NDArray[np.float64]] = {}  # the camera's position at each step of the episode
         self._seen: Frame | None = None
         self._goal_seen: Goal | None = None
-        self._goal_posed = -1  # the episode whose goal pose has been told
+        self._goal_posed = -1  # the episode whose goal pose was published
 
     def take(self, topic: Topic, part: str | None, message: Message, time_ns: int) -> Iterator[Told]:
-        """What there is to show of a message, logged at `time_ns`."""
+        """Yields what can be shown of a message that was logged at `time_ns`."""
         show: dict[Topic, Callable[[Any, fm.Timestamp], Iterator[Told]]] = {
             FRAME: self._frame, GOAL: self._goal, BELIEF: self._belief, PLAN: self._plan, TRUTH: self._truth}
         if part is not None and topic.in_step:
@@ -76,7 +79,7 @@ class Scene:
             yield from self._goal_view(at)
 
     def _goal_view(self, at: fm.Timestamp) -> Iterator[Told]:
-        """The goal's image at its pose, once both are known."""
+        """Yields the goal image at its pose, when both are known."""
         goal = self._goal_seen
         if goal is not None and goal.rgb is not None and goal.episode == self._goal_posed:
             yield "/goal/image", image(goal.rgb, GOAL_CAMERA, at)
@@ -100,8 +103,11 @@ class Scene:
         yield from self._way(truth, at)
 
     def _way(self, message: Frame | Truth, at: fm.Timestamp) -> Iterator[Told]:
-        """The path so far, once a step: the last one has a truth and no frame, and does not move the camera away from
-        its last image; a real camera has frames and no truth. What was recorded late goes where it belongs."""
+        """Yields the path so far, once for each step.
+
+        The last step has a truth and no frame, and the camera stays where it took its last image. A real camera has
+        frames and no truth. A step that was recorded late is put in its place.
+        """
         if message.episode > self._episode:
             self._episode, self._ways = message.episode, {}
         if message.episode < self._episode or message.step in self._ways:
@@ -123,7 +129,8 @@ class Scene:
                                                         texts=[label(text, belief.mean_m, rgb)])
 
     def _colour(self, name: str) -> tuple[float, float, float]:
-        """As in the run's picture: by the order of the names, all of which have percepts before the first belief."""
+        """The colour of an object, as in the run's picture. Colours follow the order of the names; all objects have
+        percepts before the first belief."""
         if name not in self._colours:
             for new in sorted(self._objects - self._colours.keys()):
                 self._colours[new] = _rgb(COLOURS[len(self._colours) % len(COLOURS)])
@@ -136,15 +143,15 @@ class Scene:
 
 
 def image(rgb: NDArray[np.uint8], frame: str, at: fm.Timestamp) -> fm.CompressedImage:
-    """An image [H, W, 3] as PNG, exact: at the lowest level it takes 5 ms and, of flat-shaded scenes, no more room than
-    a JPEG that would do."""
+    """Returns an image [H, W, 3] of uint8 as PNG, without loss. At the lowest level of compression this takes 5 ms, and
+    for flat-shaded scenes it needs no more space than a good JPEG."""
     data = io.BytesIO()
     Image.fromarray(rgb).save(data, format="PNG", compress_level=1)
     return fm.CompressedImage(timestamp=at, frame_id=frame, data=data.getvalue(), format="png")
 
 
 def depth_image(depth_m: NDArray[np.float32], frame: str, at: fm.Timestamp) -> fm.RawImage:
-    """Depth along the optical axis [H, W], metres."""
+    """Returns the depth along the optical axis [H, W], in metres."""
     height, width = depth_m.shape
     return fm.RawImage(timestamp=at, frame_id=frame, width=width, height=height, encoding="32FC1", step=4 * width,
                        data=depth_m.astype("<f4").tobytes())
@@ -152,7 +159,7 @@ def depth_image(depth_m: NDArray[np.float32], frame: str, at: fm.Timestamp) -> f
 
 def calibration(intrinsics_px: ArrayLike, size_px: tuple[int, int], frame: str,
                 at: fm.Timestamp) -> fm.CameraCalibration:
-    """A pinhole camera of (fx, fy, cx, cy) and (height, width) in pixels, without distortion."""
+    """Returns a pinhole camera without distortion, from (fx, fy, cx, cy) and (height, width) in pixels."""
     fx, fy, cx, cy = (float(x) for x in np.asarray(intrinsics_px))
     height, width = size_px
     return fm.CameraCalibration(timestamp=at, frame_id=frame, width=width, height=height,
@@ -161,7 +168,8 @@ def calibration(intrinsics_px: ArrayLike, size_px: tuple[int, int], frame: str,
 
 
 def camera_pose(topic: str, world_from_camera: NDArray[np.float64], frame: str, at: fm.Timestamp) -> Iterator[Told]:
-    """Where an OpenGL camera [4, 4] is, as the transform of its optical frame; nothing of a matrix that is no pose."""
+    """Yields the pose of an OpenGL camera [4, 4] as the transform of its optical frame. Yields nothing if the matrix is
+    not a pose."""
     world_from_optical = world_from_camera @ CAMERA_FROM_OPTICAL
     rotation = world_from_optical[:3, :3]
     if np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) and np.linalg.det(rotation) > 0:
@@ -170,7 +178,7 @@ def camera_pose(topic: str, world_from_camera: NDArray[np.float64], frame: str, 
 
 
 def cloud(points_m: NDArray[Any], rgb: tuple[float, float, float], alpha: float, at: fm.Timestamp) -> fm.PointCloud:
-    """Points [N, 3] of one colour in the world."""
+    """Returns points [N, 3] (metres, world) in one colour."""
     packed = np.empty(len(points_m), POINT)
     packed["xyz"], packed["rgba"] = points_m, np.round(255 * np.array([*rgb, alpha]))
     return fm.PointCloud(timestamp=at, frame_id=WORLD, pose=pose(np.eye(3), np.zeros(3)), point_stride=POINT.itemsize,
@@ -178,7 +186,7 @@ def cloud(points_m: NDArray[Any], rgb: tuple[float, float, float], alpha: float,
 
 
 def ellipsoid(belief: Belief, rgb: tuple[float, float, float]) -> fm.SpherePrimitive:
-    """The believed position within one standard deviation along each axis."""
+    """Returns the believed position as an ellipsoid of one standard deviation along each axis."""
     variances, axes = np.linalg.eigh(belief.covariance_m2)
     axes = axes * np.sign(np.linalg.det(axes))  # a rotation, not a mirror
     return fm.SpherePrimitive(pose=pose(axes, belief.mean_m), color=colour(rgb, 0.3 * belief.presence),
@@ -186,40 +194,40 @@ def ellipsoid(belief: Belief, rgb: tuple[float, float, float]) -> fm.SpherePrimi
 
 
 def label(text: str, at_m: ArrayLike, rgb: tuple[float, float, float]) -> fm.TextPrimitive:
-    """A text that faces the viewer, above a position [3]."""
+    """Returns a text that faces the viewer, above a position [3] (metres, world)."""
     above = np.add(at_m, (0.0, 0.0, LABEL_M))
     return fm.TextPrimitive(pose=pose(np.eye(3), above), billboard=True, font_size=LABEL_M, color=colour(rgb),
                             text=text)
 
 
 def update(name: str, at: fm.Timestamp, **primitives: Any) -> fm.SceneUpdate:
-    """One entity in the world, which replaces that of the same name on its topic."""
+    """Returns one entity in the world. It replaces the entity of the same name on its topic."""
     return fm.SceneUpdate(entities=[fm.SceneEntity(timestamp=at, frame_id=WORLD, id=name, **primitives)])
 
 
 def pose(rotation: ArrayLike, position_m: ArrayLike) -> fm.Pose:
-    """A rotation [3, 3] and a position [3]."""
+    """Returns the pose of a rotation [3, 3] and a position [3] in metres."""
     return fm.Pose(position=vector(position_m), orientation=quaternion(rotation))
 
 
 def vector(xyz: ArrayLike) -> fm.Vector3:
-    """Three numbers."""
+    """Returns three numbers as a vector."""
     x, y, z = (float(value) for value in np.asarray(xyz))
     return fm.Vector3(x=x, y=y, z=z)
 
 
 def quaternion(rotation: ArrayLike) -> fm.Quaternion:
-    """Of a rotation [3, 3]."""
+    """Returns the quaternion of a rotation [3, 3]."""
     x, y, z, w = Rotation.from_matrix(rotation).as_quat().tolist()
     return fm.Quaternion(x=x, y=y, z=z, w=w)
 
 
 def colour(rgb: tuple[float, float, float], alpha: float = 1.0) -> fm.Color:
-    """A colour of parts between 0 and 1."""
+    """Returns a colour from parts between 0 and 1."""
     return fm.Color(r=rgb[0], g=rgb[1], b=rgb[2], a=alpha)
 
 
 def _rgb(code: str) -> tuple[float, float, float]:
-    """Of "#rrggbb"."""
+    """Returns the parts, between 0 and 1, of a colour "#rrggbb"."""
     red, green, blue = bytes.fromhex(code[1:])
     return red / 255, green / 255, blue / 255

@@ -1,4 +1,4 @@
-"""What a log says about itself: its origin, its episodes, how much of what is in it and how often."""
+"""What a log says about itself: its origin, its episodes, and how many messages of which kind it holds."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SHORT = 12  # digits of a hash
 
 @dataclass
 class LogInfo:
-    """A log at a glance; `steps` by episode, `results` by episode."""
+    """An overview of a log. `steps` holds the last step of each episode, and `results` the result of each episode."""
 
     reader: RunReader
     file_size: int
@@ -39,13 +39,13 @@ class LogInfo:
 
     @property
     def duration_s(self) -> float:
-        """From the first message to the last."""
+        """Seconds from the first message to the last."""
         found = self.keys.found.values()
         return (max(key.last_ns for key in found) - min(key.first_ns for key in found)) / 1e9 if found else 0.0
 
 
 def gather(log: Path) -> LogInfo:
-    """Reads a log whole. Raises SaccadeError if it is none, or damaged from its start on."""
+    """Reads a whole log. Raises SaccadeError if the file is not a log, or if it is damaged from its start on."""
     reader = RunReader(log)
     info = LogInfo(reader, log.stat().st_size)
     for topic, part, payload, time_ns in reader.entries():
@@ -69,7 +69,7 @@ def gather(log: Path) -> LogInfo:
 
 
 def lines(info: LogInfo) -> Iterator[str]:
-    """All but the table, a line each."""
+    """Yields everything but the table, line by line."""
     yield from (printable(line, LINE_LIMIT) for line in _lines(info))
 
 

@@ -1,7 +1,8 @@
-"""A message's numbers as a protobuf message of flat fields, which Foxglove and Rerun both plot by field.
+"""Turns the numbers of a message into a protobuf message of flat fields, which Foxglove and Rerun can both plot.
 
-The schema follows from the dataclass: its scalars, texts and short fixed arrays, and its properties. JSON would do for
-Foxglove, but Rerun keeps JSON as bytes; protobuf it takes apart by the schema in the file.
+The schema follows from the dataclass: its scalars, texts and short arrays of fixed length, and its properties. JSON
+would be enough for Foxglove, but Rerun keeps JSON as bytes. Rerun splits protobuf into fields by the schema in the
+file.
 """
 
 from __future__ import annotations
@@ -22,13 +23,13 @@ from saccade.app.run.display import Progress, spread_cm
 from saccade.shared.bus.messages import ArraySpec, Belief, Message, Plan, Truth
 
 PACKAGE = "saccade"
-MOST_NUMBERS = 16  # of an array that is worth plotting
+MOST_NUMBERS = 16  # longer arrays are not worth plotting
 PROTOBUF_TYPES = {str: FieldDescriptorProto.TYPE_STRING, int: FieldDescriptorProto.TYPE_INT64,
                   float: FieldDescriptorProto.TYPE_DOUBLE, bool: FieldDescriptorProto.TYPE_BOOL}
 
 
 def goal_entropy_nats(belief: Belief) -> float | None:
-    """Entropy of the posterior over the goal's viewing direction; None while there is none."""
+    """Entropy, in nats, of the posterior over the viewing direction of the goal. None while there is no posterior."""
     if belief.goal_log_posterior is None:
         return None
     log_p = belief.goal_log_posterior.astype(np.float64)
@@ -36,7 +37,7 @@ def goal_entropy_nats(belief: Belief) -> float | None:
     return float(-(np.exp(log_p) * log_p).sum())
 
 
-# what is worth plotting and stands in no field, or there with a number that means "unknown"; None becomes NaN, a gap
+# Values worth plotting that are no field, or whose field uses a number for "unknown". None becomes NaN, a gap.
 DERIVED: dict[type[Message], dict[str, Callable[[Any, Progress], float | None]]] = {
     Belief: {"spread_cm": lambda belief, _: spread_cm(belief),
              "goal_entropy_nats": lambda belief, _: goal_entropy_nats(belief)},
@@ -46,7 +47,8 @@ DERIVED: dict[type[Message], dict[str, Callable[[Any, Progress], float | None]]]
 
 
 class Values:
-    """The numbers of one message, after `progress` has taken it. Encodes itself as Foxglove's own messages do."""
+    """The numbers of one message, after `progress` has taken it. It encodes itself in the same way as Foxglove's own
+    messages."""
 
     def __init__(self, message: Message, progress: Progress) -> None:
         self._type = type(message)
@@ -59,18 +61,18 @@ class Values:
                 self._values[name] = value.ravel().tolist() if isinstance(value, np.ndarray) else value
 
     def get_schema(self) -> Schema:
-        """The protobuf schema of this message's type."""
+        """Returns the protobuf schema of this message's type."""
         files = FileDescriptorSet(file=[_file(self._type)])
         return Schema(name=f"{PACKAGE}.{self._type.__name__}", encoding="protobuf", data=files.SerializeToString())
 
     def encode(self) -> bytes:
-        """The protobuf bytes."""
+        """Returns the protobuf bytes."""
         return _protobuf_class(self._type)(**self._values).SerializeToString()
 
 
 @functools.cache
 def _fields(message_type: type[Message]) -> dict[str, Any]:
-    """Names and kinds: short fields, then properties, then what is derived."""
+    """Names and kinds of all fields: first the short fields, then the properties, then the derived values."""
     told = {name: kind for name, kind in kinds(message_type).items() if not isinstance(kind, ArraySpec) or (
         kind.dtype != IMAGE and (fixed_numbers(kind) or math.inf) <= MOST_NUMBERS)}
     properties = [name for name, member in vars(message_type).items() if isinstance(member, property)]

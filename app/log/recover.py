@@ -1,4 +1,4 @@
-"""A good log out of a cut or damaged one: every whole record, with an index, and what could not be kept."""
+"""Makes a good log out of a cut or damaged one. It holds every whole record, an index, and a note of what was lost."""
 
 from __future__ import annotations
 
@@ -21,12 +21,15 @@ from saccade.shared.log.foreign import NAME_LIMIT, describe, foreign, is_key
 from saccade.shared.log.reading import ANY_SIZE, MOST_NOTES, NEED
 from saccade.shared.log.recording import ENDED_EARLY, KEY, LOG, RECOVERED, channel_of, json_schema, key_metadata
 
-LOST_LIMIT = 20_000  # characters of what is said about it in the new file
+LOST_LIMIT = 20_000  # characters of the note in the new file about what was lost
 
 
 @dataclass
 class Recovered:
-    """What was kept of a log and what was not. `nameless`: messages whose key stood in a damaged chunk alone."""
+    """What was kept of a log, and what was lost.
+
+    `nameless`: messages whose key was only given in a damaged chunk. `after_cut`: bytes that were lost behind the cut.
+    """
 
     messages: int = 0
     skipped: list[Skipped] = field(default_factory=list)
@@ -35,12 +38,12 @@ class Recovered:
     ended_early: str | None = None
     nameless: int = 0
     told: Counter = field(default_factory=Counter)  # metadata by name
-    left_out: int = 0  # metadata beyond what a log has
+    left_out: int = 0  # records of metadata beyond what a log has
     profile: str = ""
     ours: bool = False  # whether any message is under a key of Saccade's
 
     def lines(self) -> Iterator[str]:
-        """What was lost, a line each; none where nothing was."""
+        """Yields one line for each thing that was lost."""
         for stretch in self.skipped:
             held = f", {stretch.messages} messages" if stretch.messages else ""
             yield f"skipped at byte {stretch.offset}: {stretch.reason}, {stretch.size} bytes{held}"
@@ -59,10 +62,10 @@ class Recovered:
 
 
 def recover(log: Path, out: Path) -> Recovered:
-    """Writes every whole record of `log` into the new file `out`, with its times, in its order, and an index.
+    """Writes every whole record of `log` into the new file `out`, with its times and in its order, and adds an index.
 
-    `log` is only read. Raises SaccadeError if it cannot be read, is no log of Saccade or holds no whole message, or if
-    `out` is there already or cannot be written.
+    `log` is only read. Raises SaccadeError if `log` cannot be read, is not a log of Saccade or holds no whole message,
+    and if `out` exists or cannot be written.
     """
     with opened(log, "log", NEED, ANY_SIZE) as stream:
         is_mcap = stream.read(len(MCAP0_MAGIC)) == MCAP0_MAGIC
@@ -71,7 +74,7 @@ def recover(log: Path, out: Path) -> Recovered:
     channels: dict[int, Channel] = {}
     with whole(out) as partial:
         report = _copied(log, partial, channels)
-        if report.nameless and channels:  # their channel may have come behind them
+        if report.nameless and channels:  # their channel may have come after them
             report = _copied(log, partial, channels)
         if not report.messages:
             raise SaccadeError(f"log {log} " + (
@@ -84,7 +87,8 @@ def recover(log: Path, out: Path) -> Recovered:
 
 
 def _copied(log: Path, out: Path, channels: dict[int, Channel]) -> Recovered:
-    """The new file. `channels`: those that are known beforehand; behind it, those that have been found."""
+    """Writes the new file. `channels` holds the channels that are known before; afterwards it also holds those that
+    were found."""
     source, report = Salvage(log), Recovered()
     with out.open("wb") as stream:
         copy = Copy(stream, report, channels)
@@ -96,18 +100,18 @@ def _copied(log: Path, out: Path, channels: dict[int, Channel]) -> Recovered:
 
 
 class Copy:
-    """A new MCAP file of the records of another."""
+    """A new MCAP file that is made of the records of another one."""
 
     def __init__(self, stream: BinaryIO, report: Recovered, channels: dict[int, Channel]) -> None:
         self._writer, self._report = Writer(stream), report
         self._writer.start()
         self._schemas: dict[int, Schema] = {}
         self._found, self._channels = channels, dict(channels)
-        self._ids: dict[str, int] = {}  # in the new file, of what a channel or a schema says
-        self._known: dict[int, tuple[Channel, Schema | None, int]] = {}  # by its id, the newest and its new one
+        self._ids: dict[str, int] = {}  # ids in the new file, by the content of a channel or schema
+        self._known: dict[int, tuple[Channel, Schema | None, int]] = {}  # by old id, with the new id
 
     def take(self, record: McapRecord) -> None:
-        """Appends one record; schemas and channels are written once they have a message."""
+        """Appends one record. A schema or a channel is written when it has a message."""
         if isinstance(record, Message):
             self._message(record)
         elif isinstance(record, Channel):
@@ -123,7 +127,7 @@ class Copy:
                                         record.data)
 
     def close(self, recovered: dict[str, str]) -> None:
-        """Says where it comes from and writes the index."""
+        """Writes where the log comes from, and the index."""
         self._writer.add_metadata(RECOVERED, recovered)
         self._writer.finish()
 
@@ -167,18 +171,18 @@ class Copy:
             if channel is not None:
                 self._channels.setdefault(channel.id, channel)
             return
-        if self._report.told.total() >= MOST_NOTES // 2:  # the new log has some of its own
+        if self._report.told.total() >= MOST_NOTES // 2:  # the new log has metadata of its own
             self._report.left_out += 1
             return
         self._report.told[record.name] += 1
-        if record.name == ENDED_EARLY:  # of the recording, not of the recovered log
+        if record.name == ENDED_EARLY:  # the recording ended early, not the recovered log
             self._report.ended_early = record.metadata.get("reason", "")
         elif record.name != RECOVERED:
             self._writer.add_metadata(record.name, record.metadata)
 
 
 def _schema_of(key: str) -> Schema:
-    """The schema of a key's messages, of which the file has lost its own."""
+    """Returns the schema of a key's messages, for a file that has lost its own."""
     message_type = parse_key(key)[1].type
     text = json.dumps(json_schema(message_type), sort_keys=True).encode()
     return Schema(id=0, data=text, encoding="jsonschema", name=message_type.__name__)

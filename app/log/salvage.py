@@ -1,4 +1,4 @@
-"""Every whole record of a log, however it was cut or damaged: what is broken is passed over and told."""
+"""Reads every whole record of a log that was cut or damaged. Broken parts are passed over and reported."""
 
 from __future__ import annotations
 
@@ -26,18 +26,19 @@ from saccade.shared.log.records import (
     within,
 )
 
-# where reading may start again: a record of one of these kinds, shorter than a terabyte
+# Reading may start again at a record of one of these kinds that is shorter than a terabyte.
 ANCHOR = re.compile(rb"(?=[%b](?s:.{5})\x00\x00\x00)" % bytes((
     Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT, Opcode.METADATA, Opcode.DATA_END)))
 WINDOW = 4 * 1024 * 1024  # bytes that are searched at a time
-SEARCH_BYTES = 4 * 1024 ** 3  # that are looked at for where reading may start again, in all
-MOST_SKIPPED = 1000  # stretches that are told one by one
-INDEX_ENTRY_BYTES, INDEX_HEAD_BYTES = 16, 6  # of a chunk's index of messages
+SEARCH_BYTES = 4 * 1024 ** 3  # searched in all for places where reading may start again
+MOST_SKIPPED = 1000  # stretches that are listed one by one
+INDEX_ENTRY_BYTES, INDEX_HEAD_BYTES = 16, 6  # sizes in a chunk's index of messages
 
 
 @dataclass
 class Skipped:
-    """A stretch of a log that could not be read. `messages`: how many it held, where the file still says so."""
+    """A stretch of a log that could not be read. `offset` and `size` are in bytes. `messages` is the number of messages
+    that it held, if the file still says so."""
 
     offset: int
     size: int
@@ -46,10 +47,12 @@ class Skipped:
 
 
 class Salvage:
-    """Reads a log's records in the order of the file, those of a chunk only if the whole chunk is as it was written.
+    """Reads the records of a log in the order of the file. The records of a chunk are read only if the whole chunk is
+    undamaged.
 
-    Once `records` is through: `skipped` are the stretches passed over; `after_cut` counts the bytes at the end that
-    are no whole record, `ended` is whether the recording was finished. Raises SaccadeError for what is no file.
+    When `records` has ended, `skipped` holds the stretches that were passed over, `after_cut` is the number of bytes at
+    the end that form no whole record, and `ended` says whether the recording was finished. Raises SaccadeError if
+    `path` is not a file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -60,7 +63,8 @@ class Salvage:
             raise SaccadeError(f"log {path} is not a file")
 
     def records(self) -> Iterator[mcap.McapRecord]:
-        """Schemas, channels, messages, metadata and attachments. Raises SaccadeError if the file cannot be read."""
+        """Yields schemas, channels, messages, metadata and attachments. Raises SaccadeError if the file cannot be
+        read."""
         try:
             with self.path.open("rb") as stream:
                 self._size = os.fstat(stream.fileno()).st_size
@@ -77,13 +81,13 @@ class Salvage:
             try:
                 if end is None:
                     raise ValueError("no record")
-                if opcode == Opcode.MESSAGE_INDEX:  # those of a chunk follow it
+                if opcode == Opcode.MESSAGE_INDEX:  # the indexes of a chunk follow it
                     held = self._indexed(stream, offset, end)
                     if damaged is not None:
                         damaged.messages += held
                 elif opcode == Opcode.CHUNK:
                     data = opener.data(self._parse(stream, offset, opcode, end))
-                    for _ in within(data):  # all of it must be whole
+                    for _ in within(data):  # first, all records of the chunk must be whole
                         pass
                     damaged = None
                     yield from within(data)
@@ -102,7 +106,8 @@ class Salvage:
             offset = end
 
     def _skip(self, offset: int, end: int, reason: str) -> Skipped:
-        """Notes a stretch; what follows the one before it for the same reason, or is too many, belongs to that."""
+        """Notes a stretch. It is joined with the stretch before if it follows directly for the same reason, or if there
+        are too many."""
         last = self.skipped[-1] if self.skipped else None
         if last is not None and ((last.reason == reason and last.offset + last.size == offset and not last.messages)
                                  or len(self.skipped) >= MOST_SKIPPED):
@@ -112,7 +117,7 @@ class Salvage:
         return self.skipped[-1]
 
     def _head(self, stream: BinaryIO, offset: int) -> tuple[int, int | None]:
-        """The opcode at an offset and where its record ends; None where none can be."""
+        """Returns the opcode at an offset and the end of its record. The end is None if no record can be there."""
         stream.seek(offset)
         head = stream.read(HEAD.size)
         if len(head) < HEAD.size:
@@ -130,7 +135,7 @@ class Salvage:
         return record
 
     def _indexed(self, stream: BinaryIO, offset: int, end: int) -> int:
-        """How many messages an index of messages tells of. It may be long, and nothing of it is needed."""
+        """Returns how many messages an index of messages names. The index may be long, so its entries are not read."""
         stream.seek(offset + HEAD.size + 2)
         size = int.from_bytes(stream.read(4), "little")
         if size != end - offset - HEAD.size - INDEX_HEAD_BYTES or size % INDEX_ENTRY_BYTES:
@@ -138,7 +143,7 @@ class Salvage:
         return size // INDEX_ENTRY_BYTES
 
     def _next_anchor(self, stream: BinaryIO, start: int) -> int | None:
-        """Where the next record lies that is whole and followed by another or by the end."""
+        """Returns where the next whole record lies that is followed by another record or by the end of the file."""
         for window in range(start, self._size, WINDOW):
             stream.seek(window)
             for match in ANCHOR.finditer(stream.read(WINDOW + HEAD.size - 1)):
@@ -151,7 +156,7 @@ class Salvage:
         if end is None or (end != self._size and self._head(stream, end)[1] is None):
             return False
         self._looked_at += end - offset
-        if self._looked_at > SEARCH_BYTES:  # what has so many beginnings was made to have them
+        if self._looked_at > SEARCH_BYTES:  # a file with so many beginnings was made to have them
             return False
         try:
             if opcode == Opcode.MESSAGE_INDEX:
@@ -159,10 +164,10 @@ class Salvage:
             record = self._parse(stream, offset, opcode, end)
         except DAMAGE:
             return False
-        return not isinstance(record, mcap.Metadata) or bool(record.name)  # in zeros there are many without a name
+        return not isinstance(record, mcap.Metadata) or bool(record.name)  # zeros look like many without a name
 
     def _summary(self, stream: BinaryIO) -> Iterator[mcap.McapRecord]:
-        """The schemas and channels that a finished log repeats at its end, in case their chunk is damaged."""
+        """Yields the schemas and channels that a finished log repeats at its end, in case their chunk is damaged."""
         text = summary_of(stream)
         if text is not None:
             yield from within(text, (Opcode.SCHEMA, Opcode.CHANNEL))

@@ -1,4 +1,5 @@
-"""What commands on logs need: the valid messages and their times, and files that are there whole or not at all."""
+"""What all commands on logs need: the valid messages with their times, and outputs that are written whole or not at
+all."""
 
 from __future__ import annotations
 
@@ -23,13 +24,16 @@ SAY_EVERY = 50  # messages
 
 
 def log_of(run: Path) -> Path:
-    """The log of a run, which is given by its folder or by the log itself."""
+    """Returns the log of a run. `run` is the run's folder or the log itself."""
     return run / LOG_NAME if run.is_dir() else run
 
 
 class Log:
-    """A log as it is exported: iterating gives every valid message with its entry, and says on `console` how far it is
-    and, at the end, what the export lacks. Raises SaccadeError for a file that is no log or holds no message."""
+    """A log that is exported. Iterating yields every valid message with its entry.
+
+    On `console` it says how far it is and, at the end, what the export lacks. Raises SaccadeError if the file is not a
+    log or holds no message.
+    """
 
     def __init__(self, path: Path, console: Console | None = None) -> None:
         self.reader = RunReader(path)
@@ -55,23 +59,24 @@ class Log:
 
     @property
     def lacks(self) -> dict[str, str]:
-        """What an export of this log cannot hold, known once it is read: `cut` and `refused`, where there is such."""
+        """What an export of this log cannot hold, if there is anything: `cut` and `refused`. It is known when the log
+        has been read."""
         refused = f"{self.refused} entries of {self.reader.path} are no valid messages and were left out"
         return ({"cut": self.reader.cut} if self.reader.cut else {}) | ({"refused": refused} if self.refused else {})
 
     @property
     def goal_view_is_known(self) -> bool:
-        """Whether the truth's goal pose is that of the goal image; known from the first message on."""
+        """Whether the goal's pose in the truth is that of the goal image. It is known from the first message on."""
         return setting_of(self.reader, "scene", "goal_image") is None and not setting_of(
             self.reader, "scene", "explore")
 
 
 def setting_of(reader: RunReader, section: str, key: str) -> Any:
-    """A key of the configuration that a log holds, which may be one that today's Saccade would not take; None where it
-    holds none. Known once its first entry has been read."""
+    """Returns the value of a key in the configuration that a log holds, or None if it holds none. It is known when the
+    first entry has been read. It also works if the present Saccade would not accept the configuration."""
     try:
         tree = parse_json(reader.configuration or "{}")
-    except ValueError:  # whoever needs all of it says so
+    except ValueError:  # code that needs all of it reports the damage
         return None
     values = tree.get(section) if isinstance(tree, dict) else None
     return values.get(key) if isinstance(values, dict) else None
@@ -79,8 +84,8 @@ def setting_of(reader: RunReader, section: str, key: str) -> Any:
 
 @contextmanager
 def whole(out: Path) -> Iterator[Path]:
-    """A path beside `out`, for a file or a folder, that becomes `out` when all is well and is removed when it is not.
-    Raises SaccadeError if `out` is there already or cannot be written."""
+    """Yields a path beside `out`, for a file or a folder. It becomes `out` if all goes well, and is removed otherwise.
+    Raises SaccadeError if `out` exists or cannot be written."""
     if out.exists():
         raise SaccadeError(f"{out} is there already: name a new place")
     partial = out.with_name(f"{out.name}.part")
@@ -97,7 +102,7 @@ def whole(out: Path) -> Iterator[Path]:
 
 @contextmanager
 def extra() -> Iterator[None]:
-    """Around imports of what only exporting needs. Raises SaccadeError where it is not installed."""
+    """Is put around imports that only exporting needs. Raises SaccadeError if a package is not installed."""
     try:
         yield
     except ImportError as error:

@@ -1,8 +1,10 @@
-"""The messages of one topic as a Parquet table: a row per message, columns by its dataclass.
+"""Writes the messages of one topic as a Parquet table, with a row for each message and columns that follow from its
+dataclass.
 
-Texts, numbers and truth values are columns of their own type. Arrays are lists in row-major order, of fixed length
-where the message fixes the shape (which stands in the column's metadata); where it does not, `<name>_shape` says the
-shape of each row, and the numbers are left out (null) of a row that has more than a few. Images leave only their shape.
+Texts, numbers and truth values are columns of their own type. Arrays are lists in row-major order. If the message fixes
+the shape of an array, the list has a fixed length, and the metadata of the column holds the shape. Otherwise the column
+`<name>_shape` gives the shape in each row, and the numbers are left out (null) in a row that has more than a few. Of
+images only the shape is kept.
 """
 
 from __future__ import annotations
@@ -20,14 +22,14 @@ from saccade.shared.bus.messages import ArraySpec, Message
 from saccade.shared.bus.topics import Topic
 from saccade.shared.log.reading import Recorded
 
-ROW_GROUP = 1024  # rows: what is held in memory
-MOST_NUMBERS = 64  # of an array that is told in full: 21 positions, but no cloud and no map
+ROW_GROUP = 1024  # rows that are held in memory
+MOST_NUMBERS = 64  # of an array that is written in full, such as 21 positions, but no point cloud and no map
 TYPES = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_(), list[str]: pa.list_(pa.string())}
 NUMBERS = {"f4": pa.float32(), "f8": pa.float64()}
 
 
 class Column(NamedTuple):
-    """One column and where its value comes from."""
+    """One column, and the function that gives its value."""
 
     field: pa.Field
     value: Callable[[Recorded, Message], Any]
@@ -51,7 +53,7 @@ class Table:
             self._write()
 
     def close(self, lacks: dict[str, str]) -> None:
-        """Writes the rest; `lacks` stands in the file's metadata."""
+        """Writes the remaining rows. `lacks` is put into the metadata of the file."""
         self._write()
         self._writer.add_key_value_metadata(lacks)
         self._writer.close()
@@ -65,7 +67,7 @@ class Table:
 
 
 def columns(topic: Topic) -> list[Column]:
-    """The columns of a topic's table: when and of which part, then the message's fields in their order."""
+    """The columns of a topic's table: the time, the part, then the fields of the message in their order."""
     result = [Column(pa.field("log_time", pa.timestamp("ns", tz="UTC")), lambda entry, _: entry.log_time_ns)]
     if topic.parts:
         result.append(Column(pa.field("part", pa.string()), lambda entry, _: entry.part))

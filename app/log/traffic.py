@@ -1,4 +1,4 @@
-"""What came on each key of a log or a bus: how much, how often, of which steps, and what is missing."""
+"""Counts what arrived on each key of a log or a bus: how much, how often, for which steps, and what is missing."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ Step = tuple[int, int]  # episode and step
 
 @dataclass
 class KeyInfo:
-    """The messages of one key: how many, their bytes, how many are missing, the times (ns) and the steps of the first
-    and the last. `first`, `last`: None where none belongs to a step."""
+    """The messages of one key: how many there are, their bytes, how many are missing, and the times (ns) and steps of
+    the first and the last. `first` and `last` are None if no message belongs to a step."""
 
     messages: int = 0
     size: int = 0
@@ -28,36 +28,36 @@ class KeyInfo:
     last: Step | None = None
 
     def take(self, size: int, time_ns: int) -> None:
-        """One more."""
+        """Counts one more message."""
         self.first_ns = time_ns if not self.messages else min(self.first_ns, time_ns)
         self.last_ns = max(self.last_ns, time_ns)
         self.messages, self.size = self.messages + 1, self.size + size
 
     def belongs_to(self, step: Step) -> None:
-        """The step of one."""
+        """Notes the step of a message."""
         self.first, self.last = min(self.first or step, step), max(self.last or step, step)
 
     @property
     def rate_hz(self) -> float | None:
-        """Messages per second between the first and the last; None where there is no time between them."""
+        """Messages per second between the first and the last. None if no time has passed between them."""
         span_ns = self.last_ns - self.first_ns
         return (self.messages - 1) * 1e9 / span_ns if span_ns > 0 else None
 
     @property
     def steps(self) -> str:
-        """The steps of the first and the last as text, each with its episode."""
+        """The first and the last step as text, each with its episode."""
         return " to ".join(dict.fromkeys(f"{at[0]}:{at[1]}" for at in (self.first, self.last) if at is not None))
 
 
 @dataclass
 class Keys:
-    """The keys on which something came, and the numbers of what came there."""
+    """All keys on which something arrived, with their counts."""
 
     sequences: Sequences = field(default_factory=Sequences)
     found: dict[tuple[Topic, str | None], KeyInfo] = field(default_factory=dict)
 
     def take(self, topic: Topic, part: str | None, size: int, time_ns: int, said: Message | Stamp | None) -> None:
-        """One message of `size` bytes; `said`: None where it is no valid one."""
+        """Counts one message of `size` bytes. `said` is the message or its stamp, or None if it is not valid."""
         info = self.found.setdefault((topic, part), KeyInfo())
         info.take(size, time_ns)
         if said is None:
@@ -69,11 +69,11 @@ class Keys:
             info.gaps += missing
 
     def table(self, world: str) -> Table:
-        """A row for each key."""
-        result, missing = Table(), self.sequences.missing  # of a status, `gaps` knows
+        """Returns a table with a row for each key."""
+        result, missing = Table(), self.sequences.missing  # a status counts in `gaps`
         result.add_column("key", overflow="fold")
         result.add_column("message", no_wrap=True)
-        for header in ("messages", "bytes", "per\nsecond", "episode:\nstep", "gaps"):  # narrow, for the key's sake
+        for header in ("messages", "bytes", "per\nsecond", "episode:\nstep", "gaps"):  # narrow: the key needs room
             result.add_column(header, justify="right", no_wrap=True)
         for (topic, part), info in sorted(self.found.items(), key=lambda item: item[0][0].key(world, item[0][1])):
             rate = "" if info.rate_hz is None else f"{info.rate_hz:.2f}"

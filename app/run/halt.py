@@ -7,13 +7,14 @@ import time
 from saccade.shared.bus.messages import Message, Status
 from saccade.shared.bus.topics import Topic
 
-HALTED_S = 8.0  # all services wait for so long, without any of them having taken a step
-FRESH_S = 2.0  # a service that was not heard for longer hangs or is being started again, and its supervisor sees to it
+HALTED_S = 8.0  # the run has come to a halt if all services wait for so long and none takes a step
+FRESH_S = 2.0  # a service that was silent for longer hangs or is starting again; the supervisor handles it
 IDLE_STATES = ("ready", "finished", "not recording")
 
 
 class Pulse:
-    """Whether anything moves. In lockstep every service waits for another one now and then, but never all at once."""
+    """Knows whether a run makes progress. In lockstep every service waits for another one now and then, but never all
+    at once."""
 
     def __init__(self, names: set[str]) -> None:
         self._names = names
@@ -32,7 +33,8 @@ class Pulse:
             self._last[part] = message, now_s
 
     def halted(self) -> str | None:
-        """Why the run cannot go on: what each service waits for, or what it says. None while anything moves."""
+        """Says why the run cannot go on: what each service waits for, or what it says. None while the run makes
+        progress."""
         now_s = time.monotonic()
         idle = [now_s - heard_s <= FRESH_S and status.state in IDLE_STATES for status, heard_s in self._last.values()]
         if not self._names or set(self._last) != self._names or not all(idle):
