@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -150,7 +151,7 @@ class Log:
     def config(self) -> Config:
         """The resolved configuration of the run. Raises SaccadeError if the log holds none."""
         if self._reader.configuration is None:
-            next(RunReader.entries(self._reader), None)  # it comes before the first message
+            next(self._reader.entries(), None)  # it comes before the first message
         if self._reader.configuration is None:
             raise SaccadeError(f"log {self.path} holds no configuration")
         return recorded(self._reader.configuration, f"the log {self.path}")
@@ -166,7 +167,7 @@ class Log:
             episode = Episode(number, iter(()))
             steps = _steps(entries, episode)
             first = next(steps, None)  # when it is read, the goal is known
-            episode._steps = _chain(first, steps)
+            episode._steps = steps if first is None else chain((first,), steps)
             yield episode
             episode._pass_over()
 
@@ -225,9 +226,3 @@ def _passed_over(number: int, left: int) -> Iterator[Step]:
     raise SaccadeError(f"{left} steps of episode {number} were passed over, since a log is read once: read the steps "
                        "of an episode before you ask for the next one")
     yield
-
-
-def _chain(first: Step | None, rest: Iterator[Step]) -> Iterator[Step]:
-    if first is not None:
-        yield first
-    yield from rest

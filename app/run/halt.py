@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import time
 
+from saccade.app.run.supervisor import HUNG_S
 from saccade.shared.bus.messages import Message, Status
 from saccade.shared.bus.topics import Topic
 
 HALTED_S = 8.0  # the run has come to a halt if all services wait for so long and none takes a step
-FRESH_S = 2.0  # a service that was silent for longer hangs or is starting again; the supervisor handles it
 IDLE_STATES = ("ready", "finished", "not recording")
 
 
@@ -36,7 +36,8 @@ class Pulse:
         """Says why the run cannot go on: what each service waits for, or what it says. None while the run makes
         progress."""
         now_s = time.monotonic()
-        idle = [now_s - heard_s <= FRESH_S and status.state in IDLE_STATES for status, heard_s in self._last.values()]
+        # A service that is silent hangs or is starting again: its supervisor handles it
+        idle = [now_s - heard_s <= HUNG_S and status.state in IDLE_STATES for status, heard_s in self._last.values()]
         if not self._names or set(self._last) != self._names or not all(idle):
             self._moved_s = now_s
         if now_s - self._moved_s < HALTED_S:

@@ -13,7 +13,7 @@ from saccade.app.run.threads import limit_torch
 from saccade.shared.bus.topics import TRUTH
 from saccade.shared.config import Config
 from saccade.shared.errors import SaccadeError
-from saccade.shared.loop.modules import SOURCES, load
+from saccade.shared.loop.modules import chosen_module, load
 from saccade.shared.loop.service import Core, Service
 
 Pair = tuple[Service, Core]
@@ -133,7 +133,7 @@ def pairs_of(names: Sequence[str], config: Config) -> list[Pair]:
 def require_services(agent: str, config: Config, world: str) -> None:
     """Checks the user's modules before any process starts. Raises SaccadeError if one of them is not a service."""
     for name in (world_of(world).source, *agent_of(agent).services):
-        if getattr(config.services, "source" if name in SOURCES else name) is not None:
+        if chosen_module(name, config) is not None:
             load(name, config)
 
 

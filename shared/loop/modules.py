@@ -24,6 +24,15 @@ class ServiceModule(NamedTuple):
     build: Callable[[Config], Core]
 
 
+def _slot(name: str) -> str:
+    return "source" if name in SOURCES else name
+
+
+def chosen_module(name: str, config: Config) -> str | None:
+    """Returns the module that the configuration puts in the place of the service of that name. None if it is ours."""
+    return getattr(config.services, _slot(name), None)
+
+
 def load(name: str, config: Config, *, compare: bool = True) -> ServiceModule:
     """Returns the service that has this name in a run.
 
@@ -32,12 +41,11 @@ def load(name: str, config: Config, *, compare: bool = True) -> ServiceModule:
     out. A process then need not import Saccade's own module, once it is known that the two agree.
     """
     ours = f"saccade.services.{name}.core"
-    key = f"services.{'source' if name in SOURCES else name}"
-    chosen = getattr(config.services, key.partition(".")[2], None)
+    chosen = chosen_module(name, config)
     if chosen is None:
         module = import_module(ours)
         return ServiceModule(module.SERVICE, module.build)
-    told = f"{key}: module {chosen!r}"
+    told = f"services.{_slot(name)}: module {chosen!r}"
     try:
         module = import_module(chosen)
     except Exception as error:  # a module from outside may raise anything when it is imported
