@@ -6,9 +6,11 @@ import os
 import queue
 import signal
 import threading
+import tracemalloc
 from collections import defaultdict
 from contextlib import closing, suppress
 
+import numpy as np
 import pytest
 
 from saccade.app.log.check import missing
@@ -231,6 +233,20 @@ def test_what_holds_for_the_episode_is_kept_however_much_comes_after_it():
     assert [(k.topic, k.at) for k in outbox.answer((GOAL, FRAME), None, 1000)] == [
         (GOAL, ("r", 1, 0)), (FRAME, ("r", 1, 2))]
     assert outbox.answer((GOAL, FRAME), ("r", 0, 0), 1000)[0].at == ("r", 1, 0)
+
+
+@pytest.mark.parametrize("noisy", [False, True], ids=["an image with areas of one colour", "an image of noise"])
+def test_images_are_kept_in_bounded_memory_and_told_as_they_were_published(noisy):
+    images = [np.random.default_rng(step).bytes(100_000) if noisy else bytes([step]) * 100_000 for step in range(20)]
+    outbox = Outbox(limit_bytes=1_500_000, memory_bytes=1_000_000)
+    tracemalloc.start()
+    for step in range(20):
+        outbox.keep(FRAME, None, sample(FRAME.type, run="r", episode=0, step=step), bytearray(images[step]))
+    held, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    told = outbox.answer((FRAME,), ("r", 0, 0), 10_000_000)
+    assert [kept.payload for kept in told] == images[-(10 if noisy else 15):]
+    assert held < (1_100_000 if noisy else 100_000)
 
 
 def test_an_action_that_comes_late_is_no_news_for_a_source_that_goes_by_time():

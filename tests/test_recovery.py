@@ -15,8 +15,9 @@ from pathlib import Path
 import pytest
 
 from saccade.app.log.check import missing
-from saccade.app.run.launch import PROCESSES, launch
+from saccade.app.run.launch import PROCESSES, ROUTER, launch
 from saccade.app.run.registry import local_pairs
+from saccade.app.run.supervisor import Supervisor
 from saccade.shared.bus.topics import FRAME, STATUS
 from saccade.shared.bus.wire import stamp_of
 from saccade.shared.config import Config
@@ -78,6 +79,23 @@ def test_a_service_killed_at_any_moment_goes_on_where_it_was(tmp_path, name):
     results, said = disturbed(run_dir, dict.fromkeys(moments, kill))
     assert_as_if_nothing_had_happened(run_dir, results)
     assert [text for text in said if text.startswith(f"{name} is started again: ")]
+
+
+def test_a_router_killed_before_anyone_is_on_the_bus_is_started_again(tmp_path, monkeypatch):
+    start, killed = Supervisor.start, []
+
+    def start_and_kill(self, process):
+        start(self, process)
+        if process == ROUTER and not killed:
+            killed.append(process)
+            while not (pids := processes_of(tmp_path / "run")):
+                time.sleep(0.001)
+            os.kill(pids["router"], signal.SIGKILL)
+
+    monkeypatch.setattr(Supervisor, "start", start_and_kill)
+    results, said = disturbed(tmp_path / "run", {})
+    assert killed and any("router" in text for text in said)
+    assert_as_if_nothing_had_happened(tmp_path / "run", results)
 
 
 def test_a_service_that_hangs_is_named_and_goes_on_when_it_is_let(tmp_path, monkeypatch):
