@@ -49,7 +49,7 @@ def rate_at(step: int, steps: int, peak: float) -> float:
 
 
 def constant_rate(step: int, steps: int, peak: float) -> float:
-    """The constant learning rate of the paper."""
+    """The constant learning rate of the paper's CCNs."""
     return peak
 
 
@@ -83,7 +83,7 @@ class Trainer:
         self.task = task_of(run_dir, self.config, views, part, device)
         extraction, paper = self.config.is_extraction(part), self.config.architecture == "paper"
         self.peak = self.config.rate_extraction if extraction else self.config.rate_ccn
-        self.rate_at = constant_rate if paper else rate_at
+        self.rate_at = constant_rate if paper and not extraction else rate_at
         self.steps, self.clip = self.config.steps(part), 5.0 if extraction and not paper else 5000.0
         self.optimizer = torch.optim.Adam(self.task.module.parameters(), lr=self.peak,
                                           amsgrad=not (paper and extraction))

@@ -16,8 +16,8 @@ from saccade.shared.model.weights import Architecture
 EXTRACTION = "extraction"
 # Default settings for the paper's networks. Batches and rates are the paper's (appendix C), but there are fewer steps:
 # the paper's 5,000 epochs of 450 views are 15,000 and 25,000 steps.
-PAPER = {"steps_ccn": 5_000, "steps_extraction": 6_000, "batch_ccn": 150, "batch_extraction": 100,
-         "rate_ccn": 5e-4, "rate_extraction": 1e-4}
+PAPER = {"steps_ccn": 5_000, "steps_extraction": 6_000, "batch_ccn": 150, "batch_extraction": 50,
+         "rate_ccn": 5e-4, "rate_extraction": 1.5e-3}
 
 
 class TrainingConfig(Section):
