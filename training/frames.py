@@ -22,18 +22,15 @@ from saccade.shared.world.geometry import (
     INTRINSICS_PX,
     REFERENCE_RANGE_M,
     direction,
-    look_at,
     pixel_rays,
     project,
     rotation_towards,
     spherical,
 )
 from saccade.training.strangers import strangers, texture
+from saccade.training.table_scenes import TableScenes
 
 LEVELS = 4  # levels of the tile pyramid: 128, 64, 32 and 16 pixels
-GOAL_LIKE = 0.25  # share of images like goal images: one object, with a uniformly drawn elevation
-STRANGE_GOAL = 0.25  # share of the images like goal images that show a stranger (see strangers.py)
-STRANGE = (0.65, 0.25, 0.10)  # shares of the other images that show no, one and two strangers
 TEXTURED = 0.04  # share of images with a texture in place of the table
 
 
@@ -76,6 +73,7 @@ class FrameComposer:
     def __init__(self, known: list[ObjectViews], device: torch.device, seed: int = 0):
         self.known, self.device = len(known), device
         self.views = [*known, strangers(known, seed)]
+        self.scenes = TableScenes([v.size_m for v in self.views], len(known))
         self.pyramid = [_pyramid(v, device) for v in self.views]
         self.coverage = [torch.as_tensor(v.tiles[..., 3].mean((2, 3)) / 255.0) for v in known]  # [S, N]
         self.directions = [direction(v.azimuth_rad, v.elevation_rad) for v in self.views]
@@ -88,65 +86,11 @@ class FrameComposer:
         """Composes `count` images with their labels."""
         cameras, instances = [], []
         for scene in range(count):
-            camera, placed = self._scene(rng)
+            camera, placed = self.scenes.draw(rng)
             cameras.append(camera)
             instances += self._instances(scene, camera, placed)
         image, visible_px, mask = self._draw(cameras, instances, rng)
         return self._labels(count, instances, image, visible_px, mask)
-
-    def _scene(self, rng: np.random.Generator):
-        """Draws a camera pose [4, 4] and objects [(which, centre [3] in m, yaw in rad)].
-
-        Most scenes are like those that the agent meets, the others like those that goal images show.
-        """
-        goal_like = rng.random() < GOAL_LIKE
-        placed: list[tuple[int, NDArray[np.float64], float]] = []
-        for which in self._chosen(goal_like, rng):
-            placed.append((which, self._free_place(which, placed, rng), rng.uniform(0, 2 * np.pi)))
-        if placed and (goal_like or rng.random() < 0.55):
-            which, center, _ = placed[0]
-            half = np.linalg.norm(self.views[which].size_m) / 2
-            elevation = rng.uniform(0, np.pi / 2) if goal_like else np.arcsin(rng.random())
-            offset = direction(rng.uniform(0, 2 * np.pi), elevation)
-            position = center + rng.uniform(half + 0.05, 0.5 if goal_like else 0.8) * offset
-            target = center + rng.normal(0, 0.0 if goal_like and rng.random() < 0.7 else 0.06, 3)
-        else:
-            position = np.array([*rng.uniform(-0.5, 0.5, 2), rng.uniform(0.1, 0.6)])
-            target = np.array([*rng.uniform(-0.3, 0.3, 2), rng.uniform(0.0, 0.15)])
-        rotation = rotation_towards(target - position)
-        position = np.clip(position, [-0.5, -0.5, 0.1], [0.5, 0.5, 0.6])
-        for which, center, _ in placed:
-            radius = np.linalg.norm(self.views[which].size_m) / 2 + 0.05
-            away = position - center
-            if np.linalg.norm(away) < radius:
-                position = center + away * radius / max(np.linalg.norm(away), 1e-6)
-        camera = look_at(position, target)
-        if goal_like:
-            camera[:3, :3] = rotation
-        return camera, placed
-
-    def _chosen(self, goal_like: bool, rng: np.random.Generator) -> list[int]:
-        """Draws which objects stand on the table: known ones, each at most once, and up to two strangers, shuffled.
-
-        An image like a goal image has one object.
-        """
-        if goal_like:
-            return [self.known if rng.random() < STRANGE_GOAL else int(rng.integers(self.known))]
-        number = int(rng.integers(0 if rng.random() < 0.2 else 1, min(5, self.known) + 1))
-        chosen = [int(which) for which in rng.permutation(self.known)[:number]]
-        chosen += [self.known] * int(rng.choice(3, p=STRANGE))
-        return [chosen[n] for n in rng.permutation(len(chosen))]
-
-    def _free_place(self, which: int, placed: list, rng: np.random.Generator) -> NDArray[np.float64]:
-        """Draws a centre [3] (m) at which an object does not overlap the others, if 20 attempts are enough."""
-        size = self.views[which].size_m
-        radius = np.hypot(size[0], size[1]) / 2
-        for _ in range(20):
-            xy = rng.uniform(-0.25, 0.25, 2)
-            if all(np.linalg.norm(xy - other[1][:2]) > radius + np.hypot(*self.views[other[0]].size_m[:2]) / 2
-                   for other in placed):
-                break
-        return np.array([*xy, size[2] / 2])
 
     def _instances(self, scene: int, camera: NDArray, placed: list) -> list[_Instance]:
         """The objects in front of the camera with their nearest views, from far to near."""

@@ -13,6 +13,7 @@ import os
 import sys
 import time
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -20,7 +21,6 @@ from safetensors import SafetensorError
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from saccade.services.simulator.views import ObjectViews
 from saccade.shared.errors import SaccadeError
 from saccade.shared.files import append_line, replace_whole, writing
 from saccade.shared.log.provenance import commit
@@ -31,6 +31,25 @@ from saccade.training.settings import TrainingConfig, load_settings
 from saccade.training.tasks import CcnTask, ExtractionTask
 
 SMOOTHING = 0.99  # of the running mean of the losses
+
+
+class Task(Protocol):
+    """What is trained: networks, and what they learn at each step."""
+
+    module: nn.Module
+    lambdas: list[float]  # weights of the loss that adapt; they are kept in checkpoints
+
+    def loss(self, step: int) -> tuple[Tensor, dict[str, float]]:
+        """The loss at a step, and its parts."""
+
+    def after(self, step: int, smoothed: dict[str, float]) -> None:
+        """Is called after a step. `smoothed` are running means of the parts."""
+
+    def evaluate(self) -> dict[str, float]:
+        """Measures of the networks on data that they are not trained on."""
+
+    def draw(self, path: Path) -> None:
+        """Saves sample pictures."""
 
 
 def pick_device(name: str) -> torch.device:
@@ -53,11 +72,16 @@ def constant_rate(step: int, steps: int, peak: float) -> float:
     return peak
 
 
-def task_of(run_dir: Path, config: TrainingConfig, views: list[ObjectViews], part: str, device: torch.device):
+def task_of(run_dir: Path, config: TrainingConfig, part: str, device: torch.device) -> Task:
     """Creates the training task of a part, for the architecture of the run.
 
-    Raises SaccadeError if the part needs a CCN that is not finished.
+    Raises SaccadeError if the views are missing or damaged, or if the part needs a CCN that is not finished.
     """
+    if config.architecture == "posecnn":
+        from saccade.training.posecnn import PoseCnnTask  # here, because it loads the simulator
+
+        return PoseCnnTask(config, device)
+    views = [load_views(run_dir, name) for name in config.names]
     extraction = config.is_extraction(part)
     if config.architecture == "default":
         return (ExtractionTask if extraction else CcnTask)(config, views, part, device)
@@ -79,8 +103,7 @@ class Trainer:
         with writing(self.folder, "training run"):
             self.folder.mkdir(exist_ok=True)
         device = pick_device(self.config.device)
-        views = [load_views(run_dir, name) for name in self.config.names]
-        self.task = task_of(run_dir, self.config, views, part, device)
+        self.task = task_of(run_dir, self.config, part, device)
         extraction, paper = self.config.is_extraction(part), self.config.architecture == "paper"
         self.peak = self.config.rate_extraction if extraction else self.config.rate_ccn
         self.rate_at = constant_rate if paper and not extraction else rate_at

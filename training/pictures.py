@@ -15,6 +15,10 @@ from saccade.services.perception.paper import PaperExtraction
 from saccade.shared.model.generative_model import CCN
 from saccade.training.ccn import Pair
 from saccade.training.frames import FrameBatch
+from saccade.training.rendered import RenderedBatch
+
+_LABEL_COLOURS = torch.rand(256, 3, generator=torch.Generator().manual_seed(1)) * 0.8 + 0.2
+_LABEL_COLOURS[0] = 0.0
 
 
 def _save(path: Path, rows: list[Tensor]) -> None:
@@ -57,3 +61,10 @@ def draw_extraction(path: Path, network: Extraction, batch: FrameBatch) -> None:
         marked[b, :, v, u - 2:u + 3] = 1.0
         marked[b, :, v - 2:v + 3, u] = 1.0
     _save(path, [marked, true, seen])
+
+
+def draw_poses(path: Path, batch: RenderedBatch, labels: Tensor) -> None:
+    """Draws rows: input | true labels | predicted labels. `labels` are their logits [B, K + 1, 80, 80]."""
+    size = batch.input.shape[-2:]
+    shown = [_LABEL_COLOURS[label.cpu()].permute(0, 3, 1, 2) for label in (batch.label, labels.argmax(1))]
+    _save(path, [batch.input[:, :3], *(F.interpolate(row, size=size) for row in shown)])

@@ -23,7 +23,7 @@ from saccade.shared.model.weights import ObjectCard, write_weights
 from saccade.training.checkpoints import ccn_of, finished
 from saccade.training.dataset import render_missing
 from saccade.training.part import pick_device
-from saccade.training.settings import EXTRACTION, TrainingConfig, load_settings
+from saccade.training.settings import EXTRACTION, POSES, TrainingConfig, load_settings
 
 
 def start(run_dir: Path, config: TrainingConfig) -> TrainingConfig:
@@ -58,7 +58,8 @@ def train(run_dir: Path, config: TrainingConfig, *, jobs: int, console: Console)
                 bars[name] = progress.add_task(name, total=total, note="")
             progress.update(bars[name], completed=done, note=note)
 
-        render_missing(run_dir, config, lambda name, done, total: show(f"views {name}", done, total))
+        if config.architecture != "posecnn":  # which renders its own images
+            render_missing(run_dir, config, lambda name, done, total: show(f"views {name}", done, total))
         _train_parts(run_dir, config, jobs, show)
 
 
@@ -97,7 +98,7 @@ def _show_part(run_dir: Path, part: str, config: TrainingConfig, show) -> None:
         state = json.loads((run_dir / part / "progress.json").read_text())
     except (OSError, ValueError):
         return
-    losses = {k: v for k, v in state.items() if k not in ("step", "steps", "seconds")}
+    losses = {k: v for k, v in state.items() if k not in ("step", "steps", "seconds") and "." not in k}
     show(part, state["step"], config.steps(part), "  ".join(f"{k} {v:g}" for k, v in losses.items()))
 
 
@@ -117,20 +118,27 @@ def export(run_dir: Path, weights_dir: Path) -> None:
     paper = config.architecture == "paper"
     sizes = {name: load_mesh(config.objects, name).size_m for name in config.names}
     cards = tuple(ObjectCard(name, size, CROP_SIDE_M if paper else crop_side_m(size)) for name, size in sizes.items())
-    ranges = "from 0.40 m" if paper else "from four ranges"
+    data = f"{config.views} directions of each object of {config.objects!r}, from {{}}, composed"
+    described = {"default": data.format("four ranges"), "paper": data.format("0.40 m"),
+                 "posecnn": f"images of the objects of {config.objects!r}, rendered at every step"}
     write_weights(weights_dir, states, cards, {
-        **({"architecture": "paper", "calibration": _calibration(config, losses)} if paper else {}),
-        "data": f"{config.views} directions of each object of {config.objects!r}, {ranges}, composed",
+        **({} if config.architecture == "default" else {"architecture": config.architecture,
+                                                        "calibration": _calibration(config, losses)}),
+        "data": described[config.architecture],
         "training": config.model_dump(mode="json"), "losses": losses, "commits": commits,
         "where_trained": _where(pick_device(config.device)), "seconds": round(seconds), "torch": torch.__version__})
 
 
 def _calibration(config: TrainingConfig, losses: dict[str, dict]) -> dict[str, float]:
-    """Standard deviations of the percepts of the paper's networks, which do not predict them themselves.
+    """Standard deviations of the percepts of networks that do not predict them themselves.
 
     They are those of Gaussians with the median errors that were measured on held-out views.
     """
-    measured = {name: losses[f"{name}.{EXTRACTION}"] for name in config.names}
+    if config.architecture == "posecnn":
+        measured = {name: {key: losses[POSES][f"{name}.{key}"] for key in ("centre_px", "log_scale")}
+                    for name in config.names}
+    else:
+        measured = {name: losses[f"{name}.{EXTRACTION}"] for name in config.names}
     pixel = {f"{name}.pixel_std": round(max(m["centre_px"] / 1.1774, 2.0), 2) for name, m in measured.items()}
     return pixel | {f"{name}.log_scale_std": round(max(m["log_scale"] / 0.6745, 0.02), 4)
                     for name, m in measured.items()}

@@ -13,11 +13,16 @@ from saccade.shared.errors import SaccadeError
 from saccade.shared.files import parse_json, read_text
 from saccade.shared.model.weights import Architecture
 
-EXTRACTION = "extraction"
+EXTRACTION, POSES = "extraction", "posecnn"  # names of parts
 # Default settings for the paper's networks. Batches and rates are the paper's (appendix C), but there are fewer steps:
 # the paper's 5,000 epochs of 450 views are 15,000 and 25,000 steps.
 PAPER = {"steps_ccn": 5_000, "steps_extraction": 6_000, "batch_ccn": 150, "batch_extraction": 50,
          "rate_ccn": 5e-4, "rate_extraction": 1.5e-3}
+
+# The defaults of PoseCNN. It has one network for all objects, which counts as phase 2.
+POSECNN = {"steps_extraction": 12_000, "batch_extraction": 16, "rate_extraction": 1e-3}
+DEFAULTS: dict[str, dict[str, Any]] = {"paper": PAPER, "posecnn": POSECNN}
+OF_OTHERS = ("architecture", "kl_extraction", "guide_extraction", "ccns", "symmetric")
 
 
 class TrainingConfig(Section):
@@ -30,8 +35,10 @@ class TrainingConfig(Section):
     other defaults. Three settings belong to this architecture. `kl_extraction` is the weight of the two KL terms in
     phase 2, once they count. `guide_extraction` is the weight, at the start, of the errors of centre and scale
     themselves. The paper uses only the error of the crop; with the guide fewer steps are needed to find the object.
-    `ccns` is a folder of weights whose CCNs of these objects are used unchanged, so that only phase 2 is trained. If
-    the architecture is "default", these three and `architecture` are not saved.
+    `ccns` is a folder of weights whose CCNs of these objects are used unchanged, so that only phase 2 is trained.
+
+    With "posecnn" there is one network. `symmetric` are the objects whose rotation has the loss for symmetric objects.
+    If the architecture is "default", the settings that only others have are not saved.
     """
 
     objects: Literal["pantry", "ycb"] = "pantry"
@@ -51,17 +58,19 @@ class TrainingConfig(Section):
     kl_extraction: float = Field(1.0, ge=0)
     guide_extraction: float = Field(300.0, ge=0)
     ccns: str | None = None
+    symmetric: tuple[str, ...] = ()
 
     @model_validator(mode="before")
     @classmethod
     def _defaults(cls, given: Any) -> Any:
-        return {**PAPER, **given} if isinstance(given, dict) and given.get("architecture") == "paper" else given
+        return {**DEFAULTS.get(given.get("architecture"), {}), **given} if isinstance(given, dict) else given
 
     @model_serializer(mode="wrap")
     def _tree(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
         tree = handler(self)
         if self.architecture == "default":
-            del tree["architecture"], tree["kl_extraction"], tree["guide_extraction"], tree["ccns"]
+            for name in OF_OTHERS:
+                del tree[name]
         return tree
 
     @property
@@ -69,11 +78,13 @@ class TrainingConfig(Section):
         """The parts of the run. Each part is trained by one process."""
         if self.architecture == "paper":
             return (*(() if self.ccns else self.names), *(f"{name}.{EXTRACTION}" for name in self.names))
+        if self.architecture == "posecnn":
+            return (POSES,)
         return (EXTRACTION, *self.names)
 
     def is_extraction(self, part: str) -> bool:
         """Whether a part belongs to phase 2."""
-        return part.rpartition(".")[2] == EXTRACTION
+        return part.rpartition(".")[2] in (EXTRACTION, POSES)
 
     def needs(self, part: str) -> str | None:
         """The part that must be finished before this one begins, or None.

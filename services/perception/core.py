@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -12,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from saccade.services.perception.cropping import Cropper
 from saccade.services.perception.networks import INPUT_PX, Extraction, Identity, tally
 from saccade.services.perception.paper import PaperSceneCCN
+from saccade.services.perception.posecnn import PoseCNN
 from saccade.services.perception.seen import Seen, bits
 from saccade.shared.bus.messages import Frame, Goal, Percept
 from saccade.shared.bus.topics import FRAME, GOAL, GOAL_PERCEPT, PERCEPT, Output
@@ -43,8 +45,10 @@ class SceneCCN:
         self.passes = passes
 
     @torch.inference_mode()
-    def see(self, rgb: NDArray[np.uint8], intrinsics_px: ArrayLike, up: ArrayLike) -> Seen:
-        """Infers all objects from an image [H, W, 3]. `up` [3] is the direction of up in the camera's frame."""
+    def see(self, rgb: NDArray[np.uint8], intrinsics_px: ArrayLike, up: ArrayLike,
+            depth_m: NDArray[np.float32] | None = None) -> Seen:
+        """Infers all objects from an image [H, W, 3]. `up` [3] is the direction of up in the camera's frame. The depth
+        is not used."""
         image = torch.from_numpy(np.array(rgb)).permute(2, 0, 1).float() / 255.0
         small = F.interpolate(image[None], size=(INPUT_PX, INPUT_PX), mode="area")
         masks, vote_logits, votes = (x[0, self.rows] for x in self.extraction(small))
@@ -66,10 +70,20 @@ class SceneCCN:
                     mean.numpy(), std.numpy(), error.double().numpy(), bits((masks > 0).numpy()))
 
 
-def model_of(weights: Weights, names: tuple[str, ...], passes: int) -> SceneCCN | PaperSceneCCN:
+class Model(Protocol):
+    """Networks that infer all objects from one image."""
+
+    def see(self, rgb: NDArray[np.uint8], intrinsics_px: ArrayLike, up: ArrayLike,
+            depth_m: NDArray[np.float32] | None = None) -> Seen:
+        """Infers all objects from an image [H, W, 3], and from its depth [H, W] where there is one and they use it."""
+
+
+def model_of(weights: Weights, names: tuple[str, ...], passes: int) -> Model:
     """Creates the networks of the architecture that the weights have. Raises SaccadeError as the networks do."""
     if weights.architecture == "paper":
         return PaperSceneCCN(weights, names)
+    if weights.architecture == "posecnn":
+        return PoseCNN(weights, names)
     return SceneCCN(weights, names, passes)
 
 
@@ -86,7 +100,7 @@ class Perception:
         Raises SaccadeError if the weights do not serve them.
         """
         self.names, self.goal_told = names, False
-        self.model = model_of(self._weights, names, self._passes) if names else None
+        self.model: Model | None = model_of(self._weights, names, self._passes) if names else None
 
     def begin(self, run: str, episode: int) -> Iterable[Output]:
         """Starts an episode. Percepts depend on one image alone, so there is nothing else to reset."""
@@ -103,11 +117,11 @@ class Perception:
             self.goal_told = True
             yield from self._goal(model, inputs["goal"])
         up = frame.world_from_camera[2, :3]
-        seen = model.see(frame.rgb, frame.intrinsics_px, up)
+        seen = model.see(frame.rgb, frame.intrinsics_px, up, frame.depth_m)
         for k, name in enumerate(self.names):
             yield Output(PERCEPT, percept(frame, name, seen, k, frame.world_from_camera), name)
 
-    def _goal(self, model: SceneCCN | PaperSceneCCN, goal: Goal) -> Iterable[Output]:
+    def _goal(self, model: Model, goal: Goal) -> Iterable[Output]:
         """The percepts of the goal image. Without a goal image the presence of every object is 0."""
         if goal.rgb is None:
             blank = np.zeros((480, 480, 3), dtype=np.uint8)
@@ -126,7 +140,8 @@ def percept(source: Frame | Goal, name: str, seen: Seen, k: int, world_from_came
         pixel=seen.pixel[k], pixel_std=float(seen.pixel_std[k]), scale=float(seen.scale[k]),
         log_scale_std=float(seen.log_scale_std[k]), latent_mean=seen.latent_mean[k], latent_std=seen.latent_std[k],
         intrinsics_px=np.asarray(source.intrinsics_px), world_from_camera=np.asarray(world_from_camera),
-        reconstruction_error=float(seen.reconstruction_error[k]), mask_bits=seen.mask_bits[k])
+        reconstruction_error=float(seen.reconstruction_error[k]), mask_bits=seen.mask_bits[k],
+        camera_from_object=None if seen.camera_from_object is None else seen.camera_from_object[k])
 
 
 def build(config: Config) -> Perception:

@@ -17,7 +17,7 @@ MASK_PX = 60  # side of its masks
 CELLS = 30  # side of its grid of votes
 
 
-def _block(channels_in: int, channels_out: int, stride: int = 1, dilation: int = 1) -> nn.Sequential:
+def block(channels_in: int, channels_out: int, stride: int = 1, dilation: int = 1) -> nn.Sequential:
     return nn.Sequential(nn.Conv2d(channels_in, channels_out, 3, stride, padding=dilation, dilation=dilation),
                          nn.LeakyReLU(0.1))
 
@@ -33,11 +33,11 @@ class Extraction(nn.Module):
     def __init__(self, count: int):
         super().__init__()
         self.count = count
-        self.stem = nn.Sequential(_block(3, 16, stride=2), _block(16, 24))
-        self.middle = nn.Sequential(_block(24, 48, stride=2), _block(48, 48))
-        self.deep = nn.Sequential(_block(48, 80, stride=2), _block(80, 80), _block(80, 80, dilation=2),
-                                  _block(80, 80, dilation=4), _block(80, 48))
-        self.merge = _block(96, 64)
+        self.stem = nn.Sequential(block(3, 16, stride=2), block(16, 24))
+        self.middle = nn.Sequential(block(24, 48, stride=2), block(48, 48))
+        self.deep = nn.Sequential(block(48, 80, stride=2), block(80, 80), block(80, 80, dilation=2),
+                                  block(80, 80, dilation=4), block(80, 48))
+        self.merge = block(96, 64)
         self.votes = nn.Conv2d(64, 4 * count, 1)
         self.mask = nn.Conv2d(64 + 24, count, 3, padding=1)
 

@@ -124,8 +124,9 @@ class PaperSceneCCN:
             for what, otherwise in (("pixel_std", PIXEL_STD), ("log_scale_std", LOG_SCALE_STD)))
 
     @torch.inference_mode()
-    def see(self, rgb: NDArray[np.uint8], intrinsics_px: ArrayLike, up: ArrayLike) -> Seen:
-        """Infers all objects from an image [H, H, 3]. The paper's crops use neither intrinsics nor `up`."""
+    def see(self, rgb: NDArray[np.uint8], intrinsics_px: ArrayLike, up: ArrayLike,
+            depth_m: NDArray[np.float32] | None = None) -> Seen:
+        """Infers all objects from an image [H, H, 3]. The paper's crops use neither intrinsics, `up` nor depth."""
         image = torch.from_numpy(np.array(rgb)).permute(2, 0, 1).float() / 255.0
         everyone = image.expand(len(self.cards), 1, -1, -1, -1)
         whole, center, scale, crops, logit = (x[:, 0] for x in self.extraction(everyone))

@@ -26,3 +26,4 @@ class Seen:
     latent_std: NDArray[np.float32]  # [K, L]
     reconstruction_error: NDArray[np.float64]  # [K]
     mask_bits: NDArray[np.uint8]  # [K, M, B], see `bits`
+    camera_from_object: NDArray[np.float64] | None = None  # [K, 4, 4], of networks that estimate poses

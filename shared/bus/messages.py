@@ -74,7 +74,7 @@ class Percept(Message):
     """What the networks of one object made of one image (paper, section 3.2), on `percept` and `goal_percept`. On
     `goal_percept` the camera's pose is unknown: the identity stands for it."""
 
-    VERSION: ClassVar[int] = 2
+    VERSION: ClassVar[int] = 3
 
     object: str
     """Name of the object."""
@@ -89,7 +89,7 @@ class Percept(Message):
     log_scale_std: float
     """Calibrated standard deviation of the scale's logarithm."""
     latent_mean: Annotated[np.ndarray, array("f4", "L")]
-    """Mean of its latent pose, as seen from the camera."""
+    """Mean of its latent pose, as seen from the camera. It has no numbers if the networks estimate the pose itself."""
     latent_std: Annotated[np.ndarray, array("f4", "L")]
     """Standard deviation of its latent pose."""
     intrinsics_px: Annotated[np.ndarray, array("f8", 4)]
@@ -100,6 +100,9 @@ class Percept(Message):
     """Squared error of the decoded crop, summed over where the mask says that the object is seen."""
     mask_bits: Annotated[np.ndarray, array("u1", "M", "B")] | None = None
     """Whether the object is seen in each of MxM cells of the image: a row of cells packed into bytes."""
+    camera_from_object: Annotated[np.ndarray, array("f8", 4, 4)] | None = None
+    """Its pose in the camera's frame (metres; the object's frame has its origin at the centre of its box), from
+    networks that estimate it in place of a latent pose."""
 
     def mask(self) -> np.ndarray | None:
         """Where in the image the object is seen: truth values [M, M]. None if the message has no mask."""

@@ -47,7 +47,15 @@ def with_masks_and_candidates() -> Change:
     return change
 
 
-CHANGES: tuple[Callable[[], Change], ...] = (count_in_episodes, with_masks_and_candidates)
+def with_poses() -> Change:
+    """Format 3 to 4: percepts may have a pose in place of a latent pose."""
+    def change(topic: Topic, part: str | None, fields: Fields) -> Fields:
+        return fields | {"version": 3, "camera_from_object": None} if topic.type is m.Percept else fields
+
+    return change
+
+
+CHANGES: tuple[Callable[[], Change], ...] = (count_in_episodes, with_masks_and_candidates, with_poses)
 FORMAT = OLDEST + len(CHANGES)
 
 

@@ -27,7 +27,7 @@ from saccade.shared.files import MIB, parse_json, read_bytes, read_text, replace
 if TYPE_CHECKING:
     from torch import nn
 
-Architecture = Literal["default", "paper"]
+Architecture = Literal["default", "paper", "posecnn"]
 
 MANIFEST = "manifest.json"
 MAX_FILE_BYTES, MAX_MANIFEST_BYTES, MAX_HEADER_BYTES = 64 * MIB, 1 * MIB, 1 * MIB

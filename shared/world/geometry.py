@@ -37,6 +37,18 @@ def rotation_towards(forward: ArrayLike) -> Array:
     return np.stack([right, np.cross(back, right), back], axis=-1)
 
 
+def rotation_onto(rays: ArrayLike) -> Array:
+    """The smallest rotations [..., 3, 3] that turn the optical axis (0, 0, -1) onto unit rays [..., 3].
+
+    A ray must not point straight backwards.
+    """
+    x, y, z = np.moveaxis(np.asarray(rays, dtype=np.float64), -1, 0)
+    share = 1.0 / (1.0 - z)
+    return np.stack([np.stack([1.0 - share * x * x, -share * x * y, -x], axis=-1),
+                     np.stack([-share * x * y, 1.0 - share * y * y, -y], axis=-1),
+                     np.stack([x, y, -z], axis=-1)], axis=-2)
+
+
 def pose(rotation: ArrayLike, position: ArrayLike) -> Array:
     """Rigid transforms [..., 4, 4] from rotations [..., 3, 3] and positions [..., 3]."""
     rotation = np.asarray(rotation, dtype=np.float64)
