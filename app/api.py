@@ -22,13 +22,12 @@ from rich.console import Console
 from saccade.app.log.episodes import Log
 from saccade.app.run.agent import Agent as _Agent
 from saccade.app.run.agent import image_of
-from saccade.app.run.registry import DEFAULT_WORLD
+from saccade.app.run.registry import DEFAULT_AGENT, DEFAULT_WORLD, agent_of
 from saccade.app.run.run import run as _run
 from saccade.shared.bus.messages import Result
 from saccade.shared.config import Config, load
 from saccade.shared.errors import SaccadeError
 
-DEFAULT_AGENT = "sceneccn"
 # Several keys end in these words: this is the one that is meant
 NICKNAMES = {"bus": "bus.kind", "source": "camera.source"}
 
@@ -66,7 +65,7 @@ def run(*, goal: str | Path | ArrayLike | None = None, agent: str = DEFAULT_AGEN
     with tempfile.TemporaryDirectory() as folder:
         goal_file = None if goal is None else _file_of(goal, Path(folder))
         keys = keys_of(values) | ({} if goal_file is None else {"scene.goal_image": goal_file})
-        resolved = load(None if config is None else Path(config)).with_values(keys)
+        resolved = load(None if config is None else Path(config), agent_of(agent).preset).with_values(keys)
         finished = _run(resolved, agent=agent, world=world, out=None if out is None else Path(out), plain=True,
                         console=Console(quiet=not show))
     draw_run(finished.folder)
@@ -90,7 +89,8 @@ class Agent(_Agent):
 
     def __init__(self, *, goal: str | Path | ArrayLike | None = None, intrinsics: Sequence[float] | None = None,
                  agent: str = DEFAULT_AGENT, config: str | Path | None = None, **values: Any) -> None:
-        resolved = load(None if config is None else Path(config)).with_values(keys_of(values))
+        preset = agent_of(agent).preset
+        resolved = load(None if config is None else Path(config), preset).with_values(keys_of(values))
         super().__init__(resolved, agent=agent, goal=goal, intrinsics=intrinsics)
 
 

@@ -22,6 +22,7 @@ from pathlib import Path
 from saccade.app.run.supervisor import HUNG_KILLED_S, KEEP_PAGES, STOP_S, VIEWER
 from saccade.app.run.threads import VARIABLES
 from saccade.shared.bus.transport import ROUTER_WAIT_VARIABLE
+from saccade.shared.config import load
 from saccade.shared.errors import SaccadeError
 from saccade.shared.log.folder import CONFIG_NAME
 from saccade.shared.loop.process import EXIT_ERROR, HEARTBEAT_VARIABLE, LAUNCHER_VARIABLE
@@ -31,6 +32,7 @@ WORLD_VARIABLE, WAIT_VARIABLE = "SACCADE_WORLD", "SACCADE_WAIT"
 LATEST, OVER = "latest", "over"  # a link to the newest run, and a mark in the folder of a world that is over
 ONE_FOR_ALL = ("router", "viewer")  # all worlds share the router, and the viewer shows the first world
 VIEW_VARIABLE, VIEW_S = "SACCADE_VIEW_S", 300.0  # the viewer stays so long after a run
+PARTS_OF_AGENTS = ("perception", "belief", "planner")
 POLL_S = 0.2
 ROUTER_S = 60.0  # a service waits so long for the router, because containers start in any order
 # A process that is told to stop before it has begun gets less time: what it waits for may never come.
@@ -68,6 +70,15 @@ def mine(name: str, worlds: list[Path]) -> list[Path]:
     return [worlds[int(number)]]
 
 
+def takes_part(name: str, world: Path) -> bool:
+    """Whether a world needs a service. An agent may do without one of those that others have. Raises SaccadeError if
+    the world's configuration cannot be read."""
+    if name not in PARTS_OF_AGENTS or name in load(world / CONFIG_NAME).bus.wait_for:
+        return True
+    print(f"saccade: {name} has no part in this run", file=sys.stderr, flush=True)
+    return False
+
+
 class Container:
     """The processes of one service, one for each world."""
 
@@ -102,8 +113,11 @@ class Container:
         while not (worlds := worlds_of(latest)):
             if self._stopping.wait(POLL_S):
                 return 0
-        self._children = {world: self._start(world) for world in mine(self._name, worlds)}
+        self._children = {world: self._start(world) for world in mine(self._name, worlds)
+                          if takes_part(self._name, world)}
         while not self._stopping.wait(POLL_S) and not all((world / OVER).exists() for world in worlds):
+            if not self._children:  # it has no part in the run, and is well
+                self._heartbeat(worlds[0]).touch()
             if self._died() or self._hung():
                 self._end()
                 return EXIT_AGAIN

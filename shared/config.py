@@ -291,10 +291,25 @@ def recorded(text: str | None, where: str) -> Config:
                            "one's messages with `saccade echo --log`") from error
 
 
-def load(path: Path | None) -> Config:
-    """Reads TOML or JSON, or a preset by its name (`default`, `paper`). Returns the default if no path is given."""
+def load(path: Path | None, preset: str | None = None) -> Config:
+    """Reads TOML or JSON, or a preset by its name (`default`, `paper`). Returns the default if no path is given.
+
+    With the name of a `preset`, what the file does not say is taken from that preset.
+    """
+    base = _tree(Path(preset)) if preset else {}
     if path is None or str(path) == "default":
-        return Config()
+        return validate(base, f"preset {preset}")
+    return validate(_merged(base, _tree(path)), str(path))
+
+
+def _merged(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+    """Returns a tree that holds what `over` says, and for the rest what `base` says."""
+    both = {key: _merged(base[key], over[key]) for key in base.keys() & over.keys()
+            if isinstance(base[key], dict) and isinstance(over[key], dict)}
+    return base | over | both
+
+
+def _tree(path: Path) -> dict[str, Any]:
     if os.path.isfile(PRESETS / f"{path}.toml"):
         path = PRESETS / f"{path}.toml"
     text = read_text(path, "configuration", _NEED, MAX_FILE_BYTES)
@@ -302,7 +317,9 @@ def load(path: Path | None) -> Config:
         tree = parse_json(text) if path.suffix == ".json" else parse_toml(text)
     except ValueError as error:
         raise SaccadeError(f"configuration {path} is neither TOML nor JSON ({error}): {_NEED}") from error
-    return validate(tree, str(path))
+    if not isinstance(tree, dict):
+        raise SaccadeError(f"configuration {path} is {type(tree).__name__}, not a table of keys: {_NEED}")
+    return tree
 
 
 def weights_folder(name: str | Path | None) -> Path | None:

@@ -7,7 +7,17 @@ from typing import Annotated, Literal
 
 import typer
 
-from saccade.app.cli.options import ConfigFile, Objects, ScenesFile, Seed, Values, WeightsFolder, command_line, wide
+from saccade.app.cli.options import (
+    AGENTS,
+    ConfigFile,
+    Objects,
+    ScenesFile,
+    Seed,
+    Values,
+    WeightsFolder,
+    command_line,
+    wide,
+)
 from saccade.app.cli.texts import configured
 from saccade.shared.errors import SaccadeError
 
@@ -19,7 +29,7 @@ def bench(*, objects: Objects = None, scenes: ScenesFile = None,
           suite: Annotated[str | None, typer.Option(
               help="Scenes: paper-500, yaw-500, lexa-room, dev (for tuning) or paper-like.",
               show_default="paper-500 for ycb, paper-like for pantry")] = None,
-          agent: Annotated[str, typer.Option(help="Which agent to measure.")] = "sceneccn",
+          agent: Annotated[str, typer.Option(help=f"Which agent to measure: {AGENTS}.")] = "sceneccn",
           limit: Annotated[int | None, typer.Option(min=1, help="Run only so many scenes, chosen evenly.")] = None,
           jobs: Annotated[int, typer.Option(min=1, help="How many processes work at a time.")] = 1,
           cluster: Annotated[str | None, typer.Option(
@@ -36,7 +46,7 @@ def bench(*, objects: Objects = None, scenes: ScenesFile = None,
     from saccade.app.bench.bench import prepare
 
     resolved = configured(config, {"scene.objects": objects, "scene.file": scenes, "seed": seed,
-                                   "perception.weights": weights}, values)
+                                   "perception.weights": weights}, values, agent)
     if yaw is not None and (resolved.scene.file is not None or suite is not None):
         raise SaccadeError("--yaw is for scenes that are drawn: leave it or --scenes and --suite out")
     if yaw is not None:

@@ -9,6 +9,8 @@ from typing import Annotated, Any, Literal
 
 import typer
 
+AGENTS = ("sceneccn, paper, posecnn, posecnn-infogain, render-and-compare, lexa, or oracle (which knows the goal's "
+          "pose)")  # a test holds it to the registry, which loads too much for a help text
 Objects = Annotated[Literal["pantry", "ycb"] | None, typer.Option(help="Object set.", show_default="pantry")]
 Names = Annotated[str | None, typer.Option(help="Use only these objects of the set, such as a,b.", metavar="NAMES")]
 ConfigFile = Annotated[Path | None, typer.Option(

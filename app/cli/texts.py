@@ -8,12 +8,16 @@ from typing import Any
 from saccade.shared.errors import SaccadeError
 
 
-def configured(path: Path | None, given: dict[str, Any], values: list[str] | None) -> Any:
-    """The configuration: the file's, then the options that were given, then `--set`."""
+def configured(path: Path | None, given: dict[str, Any], values: list[str] | None, agent: str) -> Any:
+    """The configuration: the agent's, over it the file's, then the options that were given, then `--set`.
+
+    Raises SaccadeError if the agent is unknown, or if a file, a key or a value is wrong.
+    """
+    from saccade.app.run.registry import agent_of
     from saccade.shared.config import load
 
     options = {key: value for key, value in given.items() if value is not None}
-    return load(path).with_values(options | dict(parse_value(text) for text in values or ()))
+    return load(path, agent_of(agent).preset).with_values(options | dict(map(parse_value, values or ())))
 
 
 def parse_value(text: str) -> tuple[str, Any]:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from saccade.app.run.registry import agent_pairs
+from saccade.app.run.registry import DEFAULT_AGENT, agent_pairs
 from saccade.services.camera.virtual_camera import VirtualCamera
 from saccade.services.simulator.objects import names_in_use
 from saccade.shared.bus.messages import Action, Belief, Frame, Goal, Message, Percept, Plan
@@ -35,7 +35,7 @@ class Agent:
     configuration or the goal cannot be used.
     """
 
-    def __init__(self, config: Config, *, agent: str = "sceneccn", goal: str | Path | ArrayLike | None = None,
+    def __init__(self, config: Config, *, agent: str = DEFAULT_AGENT, goal: str | Path | ArrayLike | None = None,
                  intrinsics: Sequence[float] | None = None) -> None:
         self.intrinsics, self._agent = intrinsics, agent
         self.config = config.with_values({"scene.names": list(names_in_use(config.scene)), "bus.kind": "local",

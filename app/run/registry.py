@@ -41,15 +41,24 @@ DEFAULT_WORLD = "simulator"
 @dataclass(frozen=True)
 class Agent:
     """What an agent consists of: `services` are processes of their own, `cores` are modules that run only within one
-    process."""
+    process. `preset` is the configuration that makes it this agent: other networks, other modules in the services'
+    places."""
 
     services: tuple[str, ...] = ()
     cores: tuple[str, ...] = ()
+    preset: str | None = None
     weights: bool = True  # whether it needs trained weights
 
 
+DEFAULT_AGENT = "sceneccn"
+ALL_THREE = ("perception", "belief", "planner")
 AGENTS = {
-    "sceneccn": Agent(services=("perception", "belief", "planner")),
+    "sceneccn": Agent(ALL_THREE),
+    "paper": Agent(ALL_THREE, preset="paper"),
+    "posecnn": Agent(("perception", "planner"), preset="posecnn"),
+    "posecnn-infogain": Agent(ALL_THREE, preset="posecnn-infogain"),
+    "render-and-compare": Agent(ALL_THREE, preset="render-and-compare"),
+    "lexa": Agent(("planner",), preset="lexa"),
     "oracle": Agent(cores=("saccade.services.planner.oracle",), weights=False),
 }
 

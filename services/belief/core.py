@@ -17,7 +17,7 @@ from saccade.shared.config import Config
 from saccade.shared.loop.seeding import generator
 from saccade.shared.loop.service import Inputs, Service
 from saccade.shared.model.latent import LatentTransition
-from saccade.shared.model.weights import Weights
+from saccade.shared.model.weights import WITH_LATENTS, Weights
 
 SERVICE = Service("belief", inputs=(PERCEPT, GOAL_PERCEPT), trigger=PERCEPT, outputs=(BELIEF,))
 
@@ -47,7 +47,9 @@ class BeliefFilter:
         self.config, self.names = config, names
         weights = Weights(config.weights)
         self.radius_m = {card.name: card.radius_m for card in weights.cards_of(names)}
-        self.transitions = {name: LatentTransition(weights, name) for name in names}
+        # Networks that estimate poses have no latent poses, and so no transition.
+        latent = weights.architecture in WITH_LATENTS
+        self.transitions = {name: LatentTransition(weights, name) for name in names} if latent else {}
 
     def begin(self, run: str, episode: int) -> Iterable[Output]:
         """Starts an episode. Nothing is known about its scene yet, and nothing is published."""
@@ -69,7 +71,8 @@ class BeliefFilter:
             self.goal_known = True
             self.goal_views = {
                 name: GoalView(self.config.belief, self.transitions[name], goal)
-                for name, goal in inputs["goal_percept"].items() if goal.presence > WORTH_COMPARING}
+                for name, goal in inputs["goal_percept"].items()
+                if len(goal.latent_mean) and goal.presence > WORTH_COMPARING}
         present = {name for name in self.names if percepts[name].presence > self.config.belief.present_above}
         for name in self.names:
             yield Output(BELIEF, self._update(name, percepts, present), name)
@@ -116,8 +119,10 @@ class BeliefFilter:
             return terms
         last, name = self.last_seen.get(percept.object), percept.object
         self.last_seen[name] = percept
-        return terms | {"f_crop": crop_term(percept, before), "f_likelihood": likelihood_term(percept),
-                        "f_pose": pose_term(percept, last, after[0], self.transitions[name])}
+        terms |= {"f_crop": crop_term(percept, before), "f_likelihood": likelihood_term(percept)}
+        if len(percept.latent_mean):
+            terms["f_pose"] = pose_term(percept, last, after[0], self.transitions[name])
+        return terms
 
 
 def build(config: Config) -> BeliefFilter:

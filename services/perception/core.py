@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -27,6 +28,22 @@ SERVICE = Service("perception", inputs=(FRAME, GOAL), trigger=FRAME, outputs=(PE
                   divisible=True)
 
 
+@dataclass(frozen=True)
+class Found:
+    """K objects as they were found in an image: crops [K, 3, 64, 64] and their masks [K, 1, 64, 64], the windows that
+    they fill, presences [K], the standard deviations of the windows (two of the place in crop sides, one of the
+    log scale) [K, 3], the sides of the crops in pixels [K], and the masks in the image. `cropper` cuts further crops."""
+
+    cropper: Cropper
+    crops: torch.Tensor
+    crop_masks: torch.Tensor
+    window: Window
+    presence: NDArray[np.float64]
+    deviation: NDArray[np.float32]
+    side_px: NDArray[np.float64]
+    mask_bits: NDArray[np.uint8]
+
+
 class SceneCCN:
     """The networks of K objects, and how they work together.
 
@@ -49,6 +66,17 @@ class SceneCCN:
             depth_m: NDArray[np.float32] | None = None) -> Seen:
         """Infers all objects from an image [H, W, 3]. `up` [3] is the direction of up in the camera's frame. The depth
         is not used."""
+        found = self.find(rgb, intrinsics_px, up)
+        crops, crop_masks, window, deviation = found.crops, found.crop_masks, found.window, found.deviation
+        masked = torch.cat([crops * crop_masks, crop_masks], dim=1)
+        mean, std = (x[:, 0] for x in self.encoder(masked[:, None]))
+        error = ((self.decoder(mean[:, None])[:, 0] * crop_masks - masked[:, :3]) ** 2).sum((1, 2, 3))
+        return Seen(found.presence, window.pixels, found.side_px * deviation[:, :2].mean(1), window.scales,
+                    deviation[:, 2], mean.numpy(), std.numpy(), error.double().numpy(), found.mask_bits)
+
+    @torch.inference_mode()
+    def find(self, rgb: NDArray[np.uint8], intrinsics_px: ArrayLike, up: ArrayLike) -> Found:
+        """Finds all objects in an image, and cuts them out. The arguments are those of `see`."""
         image = torch.from_numpy(np.array(rgb)).permute(2, 0, 1).float() / 255.0
         small = F.interpolate(image[None], size=(INPUT_PX, INPUT_PX), mode="area")
         masks, vote_logits, votes = (x[0, self.rows] for x in self.extraction(small))
@@ -60,14 +88,10 @@ class SceneCCN:
             raw = torch.cat([crops, crop_masks], dim=1)
             identity_logit, correction, log_std = (x[:, 0] for x in self.identity(raw[:, None]))
             before, window = window, cropper.corrected(window, correction.double().clamp(-0.5, 0.5).numpy())
-        masked = torch.cat([crops * crop_masks, crop_masks], dim=1)
-        mean, std = (x[:, 0] for x in self.encoder(masked[:, None]))
-        error = ((self.decoder(mean[:, None])[:, 0] * crop_masks - masked[:, :3]) ** 2).sum((1, 2, 3))
         presence = (logit.sigmoid() * identity_logit.sigmoid()).double().numpy()
         deviation = log_std.exp().double().numpy()
         side_px = 2 * before.half_tangent * float(np.asarray(intrinsics_px)[0])
-        return Seen(presence, window.pixels, side_px * deviation[:, :2].mean(1), window.scales, deviation[:, 2],
-                    mean.numpy(), std.numpy(), error.double().numpy(), bits((masks > 0).numpy()))
+        return Found(cropper, crops, crop_masks, window, presence, deviation, side_px, bits((masks > 0).numpy()))
 
 
 class Model(Protocol):
@@ -88,10 +112,13 @@ def model_of(weights: Weights, names: tuple[str, ...], passes: int) -> Model:
 
 
 class Perception:
-    """Turns frames into percepts. Once per episode it does the same with the goal image, with the same networks."""
+    """Turns frames into percepts. Once per episode it does the same with the goal image, with the same networks.
 
-    def __init__(self, config: Config, names: tuple[str, ...]):
-        self._weights, self._passes = Weights(config.weights), config.perception.passes
+    `make` creates the networks for some of the objects.
+    """
+
+    def __init__(self, make: Callable[[tuple[str, ...]], Model], names: tuple[str, ...]):
+        self._make = make
         self.share(names)
 
     def share(self, names: tuple[str, ...]) -> None:
@@ -100,7 +127,7 @@ class Perception:
         Raises SaccadeError if the weights do not serve them.
         """
         self.names, self.goal_told = names, False
-        self.model: Model | None = model_of(self._weights, names, self._passes) if names else None
+        self.model = self._make(names) if names else None
 
     def begin(self, run: str, episode: int) -> Iterable[Output]:
         """Starts an episode. Percepts depend on one image alone, so there is nothing else to reset."""
@@ -146,4 +173,5 @@ def percept(source: Frame | Goal, name: str, seen: Seen, k: int, world_from_came
 
 def build(config: Config) -> Perception:
     """Creates the core from a run's configuration. Raises SaccadeError if the weights do not serve its objects."""
-    return Perception(config, config.names)
+    weights = Weights(config.weights)
+    return Perception(lambda names: model_of(weights, names, config.perception.passes), config.names)

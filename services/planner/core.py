@@ -90,7 +90,7 @@ class Planner:
             known = preference.confidence >= self.config.planner.goal_confidence
             self.preference = preference if known and not self.config.scene.explore else None
         self._refine(beliefs)
-        spheres = self._obstacles(beliefs)
+        spheres = self.obstacles(beliefs)
         chosen, declared = self.plan, False
         arrived = chosen is not None and self._arrived(camera, chosen.viewpoint)
         if chosen is not None and arrived and chosen.mode == "goal":
@@ -137,7 +137,7 @@ class Planner:
         heading[:3, 3] = plan.viewpoint[:3, 3]
         return heading
 
-    def _obstacles(self, beliefs: dict[str, Belief]) -> Spheres:
+    def obstacles(self, beliefs: dict[str, Belief]) -> Spheres:
         """Spheres around the objects whose presence and position the agent is sure of."""
         known = [b for b in beliefs.values() if b.presence > 0.5 and np.trace(b.covariance_m2) < KNOWN_M ** 2]
         return spheres_around(np.array([b.mean_m for b in known]).reshape(-1, 3),

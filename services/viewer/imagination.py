@@ -12,9 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from saccade.services.viewer.layout import VIEW_PX
 from saccade.shared.bus.messages import Belief, Frame, Percept
+from saccade.shared.errors import SaccadeError
 from saccade.shared.model.drawing import LatentDecoder
 from saccade.shared.model.latent import LatentTransition
-from saccade.shared.model.weights import Weights
+from saccade.shared.model.weights import WITH_LATENTS, Weights
 from saccade.shared.world.geometry import IMAGE_SIZE_PX, INTRINSICS_PX, REFERENCE_RANGE_M, project, spherical, wrap
 from saccade.shared.world.windows import CROP_PX, Window
 
@@ -36,10 +37,12 @@ def ring_of(window: Window, intrinsics_px: ArrayLike, up: ArrayLike) -> NDArray[
 class Imagination:
     """The decoders and transitions of a run's objects.
 
-    Raises SaccadeError if an object has no weights, or if they do not match the manifest.
+    Raises SaccadeError if an object has no weights, if they do not match the manifest, or if they draw nothing.
     """
 
     def __init__(self, weights: Weights, names: tuple[str, ...]) -> None:
+        if weights.architecture not in WITH_LATENTS:
+            raise SaccadeError(f"networks of the architecture {weights.architecture!r} draw nothing")
         self.cards = {card.name: card for card in weights.cards_of(names)}
         self._decoders = {name: LatentDecoder(weights, name) for name in names}
         self._transitions = {name: LatentTransition(weights, name) for name in names}

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from torch import nn
 
 Architecture = Literal["default", "paper", "posecnn"]
+WITH_LATENTS = ("default", "paper")  # architectures with a CCN for each object
 
 MANIFEST = "manifest.json"
 MAX_FILE_BYTES, MAX_MANIFEST_BYTES, MAX_HEADER_BYTES = 64 * MIB, 1 * MIB, 1 * MIB

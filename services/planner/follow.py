@@ -1,0 +1,99 @@
+"""The planner of the paper's PoseCNN: it follows the transform between the target's pose now and in the goal image.
+
+The percepts must carry poses. Every step moves the camera by at most 5 cm towards the goal's view. Where the target is
+not seen, the camera stops. `seek` looks for it instead.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from saccade.services.planner.motion import step_towards
+from saccade.shared.bus.messages import Action, Percept, Plan
+from saccade.shared.bus.topics import ACTION, GOAL_PERCEPT, PERCEPT, PLAN, Output
+from saccade.shared.config import Config
+from saccade.shared.errors import SaccadeError
+from saccade.shared.loop.service import Inputs, Service
+from saccade.shared.world.geometry import Array, rotation_angle
+from saccade.shared.world.task import Spheres
+
+SERVICE = Service("planner", inputs=(PERCEPT, GOAL_PERCEPT), trigger=PERCEPT, outputs=(PLAN, ACTION))
+
+ARRIVED_M, ARRIVED_RAD = 0.02, 0.1  # the agent says that it has arrived if the transform that is left is below these
+NO_SPHERES = Spheres(np.zeros((0, 3)), np.zeros(0))  # it knows nothing of what is in the way
+
+
+class Follower:
+    """Follows the relative pose. Its only state is which object the goal image shows."""
+
+    def __init__(self, config: Config):
+        self.step_m, self.present_above = config.planner.step_m, config.belief.present_above
+        self.explores = config.scene.explore
+
+    def begin(self, run: str, episode: int) -> Iterable[Output]:
+        """Starts an episode with a new goal. Nothing is published."""
+        self.target: str | None = None
+        return ()
+
+    def step(self, inputs: Inputs) -> Iterable[Output]:
+        """Yields a plan and an action, computed from the percepts of one image."""
+        percepts: dict[str, Percept] = inputs["percept"]
+        goal = self.goal(inputs["goal_percept"])
+        seen = percepts[goal.object]
+        yield from self.follow(seen, goal) if self.sees(seen, goal) else self._stop(seen, goal)
+
+    def goal(self, goals: dict[str, Percept]) -> Percept:
+        """The goal's percept of the target, which is the object with the highest presence."""
+        if self.target is None:
+            self.target = max(sorted(goals), key=lambda name: goals[name].presence)
+        return goals[self.target]
+
+    def sees(self, percept: Percept, goal: Percept) -> bool:
+        """Whether there is a transform to follow: the target is seen, and there is a goal image.
+
+        Raises SaccadeError if the percepts carry no poses.
+        """
+        if percept.camera_from_object is None or goal.camera_from_object is None:
+            raise SaccadeError("this planner follows poses, and the percepts carry none: choose an agent whose "
+                               "perception estimates poses, such as posecnn")
+        return not self.explores and goal.presence > 0.0 and percept.presence > self.present_above
+
+    def follow(self, percept: Percept, goal: Percept, spheres: Spheres = NO_SPHERES) -> Iterable[Output]:
+        """Yields the plan to go where the goal image was taken, and the next step on this way, around the spheres."""
+        camera = percept.world_from_camera
+        viewpoint = goal_view(percept, goal)
+        distance = float(np.linalg.norm(viewpoint[:3, 3] - camera[:3, 3]))
+        turn = float(rotation_angle(viewpoint[:3, :3], camera[:3, :3]))
+        move = step_towards(camera, viewpoint, spheres, self.step_m)
+        arrived = distance < ARRIVED_M and turn < ARRIVED_RAD
+        center = (camera @ np.asarray(percept.camera_from_object))[:3, 3]
+        return _outputs(percept, goal, viewpoint, center, move, distance, arrived)
+
+    def _stop(self, percept: Percept, goal: Percept) -> Iterable[Output]:
+        camera = np.array(percept.world_from_camera)
+        ahead = camera[:3, 3] - 0.4 * camera[:3, 2]
+        return _outputs(percept, goal, camera, ahead, (np.zeros(3), np.zeros(3)), -1.0, arrived=False)
+
+
+def goal_view(percept: Percept, goal: Percept) -> Array:
+    """The pose world_from_camera [4, 4] from which the goal image was taken, by the target's poses in both images."""
+    there = np.linalg.inv(np.asarray(goal.camera_from_object))
+    return np.asarray(percept.world_from_camera @ np.asarray(percept.camera_from_object) @ there)
+
+
+def _outputs(percept: Percept, goal: Percept, viewpoint: Array, look_at: Array, move: tuple[Array, Array],
+             distance_m: float, arrived: bool) -> Iterable[Output]:
+    mode = "goal" if distance_m >= 0.0 else "search"
+    plan = Plan(run=percept.run, episode=percept.episode, step=percept.step, target=goal.object, mode=mode,
+                viewpoint=viewpoint, look_at_m=look_at, g_position=0.0, g_scale=0.0, g_pose=0.0, g_information=0.0,
+                candidates=1, goal_confidence=goal.presence, believed_distance_m=distance_m, arrived=arrived)
+    yield Output(PLAN, plan)
+    yield Output(ACTION, Action(run=plan.run, episode=plan.episode, step=plan.step, translation_m=move[0],
+                                rotation_rad=move[1], arrived=arrived))
+
+
+def build(config: Config) -> Follower:
+    """Creates the core from a run's configuration."""
+    return Follower(config)
