@@ -118,7 +118,7 @@ def test_topics_lists_the_registry(monkeypatch, capsys):
     (("train", "--set", "batch_ccn=0"), "training setting 'batch_ccn'"),
     (("run", "--config", "none.toml"), "none.toml cannot be read"),
     (("run", "--names", "teapot"), "'teapot' is not in 'pantry': choose from coffee_can"),
-    (("run", "--agent", "nobody"), "agent 'nobody' is unknown: choose from sceneccn, oracle"),
+    (("run", "--agent", "nobody"), "agent 'nobody' is unknown: choose from sceneccn, paper"),
     (("run", "--agent", "oracle"), "add `--bus local`"),
     (("run", "--weights", "none"), "none/manifest.json are missing: train them"),
     (("run", "--agent", "oracle", "--bus", "local", "--scene", "s1"), "scene.scene needs scene.file"),
@@ -153,7 +153,8 @@ def test_unknown_options_are_refused(monkeypatch, capsys):
 def test_options_go_before_the_file_and_set_before_all(tmp_path):
     """file < option < --set; a value that is not JSON is text."""
     (tmp_path / "c.toml").write_text('seed = 1\n[scene]\nobjects = "ycb"\nyaw = "fixed"\n[planner]\nstep_m = 0.01\n')
-    config = texts.configured(tmp_path / "c.toml", {"seed": 2, "scene.objects": None}, ["planner.step_m=0.03"])
+    given = {"seed": 2, "scene.objects": None}
+    config = texts.configured(tmp_path / "c.toml", given, ["planner.step_m=0.03"], "sceneccn")
     assert (config.seed, config.scene.objects, config.scene.yaw, config.planner.step_m) == (2, "ycb", "fixed", 0.03)
     assert texts.parse_value('scene.names=["a"]') == ("scene.names", ["a"])
     assert texts.parse_value("bus.world=a=b") == ("bus.world", "a=b")

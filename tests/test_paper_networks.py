@@ -154,7 +154,10 @@ def test_perception_sees_all_objects_as_one_by_one(weights):
     fast = PaperSceneCCN(weights, NAMES).see(IMAGE, INTRINSICS_PX, UP)
     slow = PaperSceneCCN(weights, NAMES, one_by_one=True).see(IMAGE, INTRINSICS_PX, UP)
     assert fast.latent_mean.shape == (2, LATENT)
+    assert fast.camera_from_object is None
     for name, value in vars(fast).items():
+        if value is None:
+            continue
         assert np.allclose(value, getattr(slow, name), rtol=1e-4, atol=1e-4), name
         assert np.isfinite(value).all()
 
@@ -235,7 +238,7 @@ def test_the_measure_of_a_ccn_asks_only_for_displacements_that_it_was_trained_on
 
 def test_the_paper_has_its_own_defaults_and_ours_are_as_they_were():
     paper = TrainingConfig(names=NAMES, architecture="paper")
-    assert (paper.batch_ccn, paper.rate_ccn, paper.batch_extraction, paper.rate_extraction) == (150, 5e-4, 100, 1e-4)
+    assert (paper.batch_ccn, paper.rate_ccn, paper.batch_extraction, paper.rate_extraction) == (150, 5e-4, 50, 1.5e-3)
     assert TrainingConfig(names=NAMES, architecture="paper", batch_ccn=20).batch_ccn == 20
     assert TrainingConfig.model_validate_json(paper.model_dump_json()) == paper
     ours = TrainingConfig(names=NAMES)

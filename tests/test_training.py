@@ -102,7 +102,7 @@ def test_the_composed_frames_agree_with_their_labels(finished):
 def test_strangers_are_drawn_but_have_no_label(finished):
     """Every image holds a stranger alone: something is drawn on the table, and no known object is labelled."""
     composer = FrameComposer([load_views(finished, name) for name in NAMES], torch.device("cpu"))
-    composer._chosen = lambda goal_like, rng: [composer.known]
+    composer.scenes._chosen = lambda goal_like, rng: [composer.known]
     batch = composer.compose(20, np.random.default_rng(0))
     shades = [len(torch.unique((image[:, ::4, ::4] * 8).round().flatten(1), dim=1).T) for image in batch.image]
     assert np.median(shades) > 10

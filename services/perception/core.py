@@ -19,9 +19,10 @@ from saccade.services.perception.seen import Seen, bits
 from saccade.shared.bus.messages import Frame, Goal, Percept
 from saccade.shared.bus.topics import FRAME, GOAL, GOAL_PERCEPT, PERCEPT, Output
 from saccade.shared.config import Config
+from saccade.shared.errors import SaccadeError
 from saccade.shared.loop.service import Inputs, Service
 from saccade.shared.model.generative_model import Decoder, Encoder, Stacked
-from saccade.shared.model.weights import Weights
+from saccade.shared.model.weights import WITH_LATENTS, Weights
 from saccade.shared.world.windows import Window
 
 SERVICE = Service("perception", inputs=(FRAME, GOAL), trigger=FRAME, outputs=(PERCEPT, GOAL_PERCEPT),
@@ -30,9 +31,12 @@ SERVICE = Service("perception", inputs=(FRAME, GOAL), trigger=FRAME, outputs=(PE
 
 @dataclass(frozen=True)
 class Found:
-    """K objects as they were found in an image: crops [K, 3, 64, 64] and their masks [K, 1, 64, 64], the windows that
-    they fill, presences [K], the standard deviations of the windows (two of the place in crop sides, one of the
-    log scale) [K, 3], the sides of the crops in pixels [K], and the masks in the image. `cropper` cuts further crops."""
+    """K objects as found in an image.
+
+    crops [K, 3, 64, 64] and their masks [K, 1, 64, 64]; the windows that the objects fill; presences [K]; standard
+    deviations of the windows (two of the place in crop sides, one of the log scale) [K, 3]; sides of the crops in
+    pixels [K]; masks in the image. `cropper` cuts further crops.
+    """
 
     cropper: Cropper
     crops: torch.Tensor
@@ -172,6 +176,10 @@ def percept(source: Frame | Goal, name: str, seen: Seen, k: int, world_from_came
 
 
 def build(config: Config) -> Perception:
-    """Creates the core from a run's configuration. Raises SaccadeError if the weights do not serve its objects."""
-    weights = Weights(config.weights)
+    """Creates the core from a run's configuration. Raises SaccadeError if the weights do not serve its objects, or if
+    they infer poses where latent poses are wanted, or the reverse."""
+    weights, wanted = Weights(config.weights), config.perception.architecture
+    if (weights.architecture in WITH_LATENTS) != (wanted in WITH_LATENTS):
+        raise SaccadeError(f"weights {weights.folder} are of the architecture {weights.architecture!r}, and this agent "
+                           f"needs {wanted!r}: name other weights, or choose the agent that works with these")
     return Perception(lambda names: model_of(weights, names, config.perception.passes), config.names)

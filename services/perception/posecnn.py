@@ -26,7 +26,7 @@ CHANNELS = 5  # red, green, blue, depth, and whether there is a depth
 DEPTH_M, DEPTH_SPAN_M = 0.5, 0.5  # a depth enters as (depth - 0.5 m) / 0.5 m, at most 2
 FEW_CELLS = 3.0  # so many labelled cells make the presence half as sure
 MOST_VOTERS = 200  # more cells of one object say nothing new
-INLIER = 0.95  # cosine of the largest angle between a vote and the direction to a centre that it supports
+INLIERS = (0.95, 0.99)  # cosine of the largest angle between a vote and the direction to a centre that it supports
 _SPAN = (-0.25, 1.25)  # where centres are looked for, in image widths
 _CANDIDATES = 61  # per axis
 PIXEL_STD, LOG_SCALE_STD = 8.0, 0.08  # of a percept, if the manifest gives none
@@ -97,15 +97,17 @@ def hough_center(cells: Tensor, directions: Tensor, weight: Tensor) -> tuple[Ten
     axis = torch.linspace(*_SPAN, _CANDIDATES)
     candidates = torch.stack(torch.meshgrid(axis, axis, indexing="xy"), dim=-1).view(-1, 2)
     towards = F.normalize(candidates[:, None] - cells, dim=-1)  # [C, N, 2]
-    supported = (towards * directions).sum(-1) > INLIER
+    supported = (towards * directions).sum(-1) > INLIERS[0]
     best = candidates[torch.argmax((supported * weight).sum(1))]
-    inliers = (F.normalize(best - cells, dim=-1) * directions).sum(-1) > INLIER
-    across = torch.eye(2) - directions[:, :, None] * directions[:, None, :]
-    across = across * (weight * inliers)[:, None, None]
-    # The small share of the identity keeps the point at the candidate where the lines are nearly parallel.
-    left = across.sum(0) + 0.02 * torch.eye(2)
-    right = (across @ cells[:, :, None]).sum(0) + 0.02 * best[:, None]
-    return torch.linalg.solve(left, right)[:, 0], inliers
+    across = (torch.eye(2) - directions[:, :, None] * directions[:, None, :]) * weight[:, None, None]
+    for least in INLIERS:  # of the refined point the supporters are counted more strictly
+        inliers = (F.normalize(best - cells, dim=-1) * directions).sum(-1) > least
+        chosen = across * inliers[:, None, None]
+        # The small share of the identity keeps the point where it is if the lines are nearly parallel.
+        left = chosen.sum(0) + 0.01 * torch.eye(2)
+        right = (chosen @ cells[:, :, None]).sum(0) + 0.01 * best[:, None]
+        best = torch.linalg.solve(left, right)[:, 0]
+    return best, inliers
 
 
 def rotation_of(quaternion: Tensor) -> Tensor:
