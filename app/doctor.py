@@ -15,14 +15,14 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from saccade.services.simulator.objects import names_of, ycb_folder
-from saccade.services.simulator.opengl import choose_backend
 from saccade.shared.bus.messages import Status
 from saccade.shared.bus.topics import STATUS, Topic
 from saccade.shared.bus.transport import ZenohBus, free_endpoint
 from saccade.shared.bus.wire import encode
 from saccade.shared.config import Config, SceneConfig
 from saccade.shared.errors import SaccadeError
+from saccade.shared.render.objects import names_of, ycb_folder
+from saccade.shared.render.opengl import choose_backend
 
 OLDEST_PYTHON = (3, 11)
 ANSWER_S = 10.0
@@ -30,8 +30,8 @@ RENDER_S = 120.0
 ROOM_BYTES = 64 * 1024 * 1024
 RENDER = """
 import numpy as np
-from saccade.services.simulator.objects import load_mesh, names_of
-from saccade.services.simulator.world import World
+from saccade.shared.render.objects import load_mesh, names_of
+from saccade.shared.render.world import World
 from saccade.shared.world.task import start_pose
 mesh = load_mesh("pantry", names_of("pantry")[0])
 world = World((mesh,))

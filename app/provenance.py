@@ -7,8 +7,8 @@ import platform
 from importlib import metadata
 from pathlib import Path
 
-from saccade.services.simulator.opengl import choose_backend
 from saccade.shared.config import PACKAGE
+from saccade.shared.render.opengl import choose_backend
 
 PACKAGES = ("numpy", "torch", "mujoco")
 

@@ -22,11 +22,11 @@ from rich.table import Table
 
 from saccade.benchmarks.rounds import in_turn
 from saccade.services.perception.core import SceneCCN
-from saccade.services.simulator.objects import names_of
 from saccade.shared.bus.topics import TRUTH
 from saccade.shared.config import PACKAGE, WEIGHTS
 from saccade.shared.log.reading import RunReader
 from saccade.shared.model.weights import Weights
+from saccade.shared.render.objects import names_of
 from saccade.shared.world.geometry import INTRINSICS_PX
 
 ROUNDS, SCENES, REPEATS = 3, 8, 60

@@ -14,7 +14,7 @@ if [ ! -x .venv/bin/python ] && ! "$python" -m venv .venv; then
 fi
 .venv/bin/python -m pip install --quiet --editable '.[all]'
 
-has_opengl() { .venv/bin/python -c 'from saccade.services.simulator.opengl import choose_backend; choose_backend()' 2>/dev/null; }
+has_opengl() { .venv/bin/python -c 'from saccade.shared.render.opengl import choose_backend; choose_backend()' 2>/dev/null; }
 
 if ! has_opengl; then
     if [ "$(id -u)" = 0 ] && command -v apt-get >/dev/null; then

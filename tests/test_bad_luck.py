@@ -9,12 +9,12 @@ from saccade.app.run.registry import agent_pairs
 from saccade.services.evaluator import core as evaluator
 from saccade.services.perception.core import SceneCCN
 from saccade.services.simulator.core import SERVICE, Simulator
-from saccade.services.simulator.objects import load_mesh, names_of
 from saccade.services.simulator.scenes import Placed, generate_split
-from saccade.services.simulator.world import World
 from saccade.shared.config import WEIGHTS, Config
 from saccade.shared.loop.local import run_local
 from saccade.shared.model.weights import Weights
+from saccade.shared.render.objects import load_mesh, names_of
+from saccade.shared.render.world import World
 from saccade.shared.world.geometry import look_at
 from saccade.shared.world.task import START_RANGE_M, start_pose
 

@@ -16,9 +16,9 @@ from PIL import Image
 from saccade.services.camera import sources
 from saccade.services.camera.poses import MAX_POSES, read_poses
 from saccade.services.camera.sources import Folder, open_source
-from saccade.services.simulator import mesh
-from saccade.services.simulator.mesh import read_obj, read_texture
 from saccade.shared.errors import SaccadeError
+from saccade.shared.render import mesh
+from saccade.shared.render.mesh import read_obj, read_texture
 from saccade.shared.world import images
 from saccade.shared.world.images import image_size, read_goal_image, read_image
 from saccade.tests.hostile import MANY, complaint, not_files, sparse

@@ -7,10 +7,10 @@ import pytest
 
 from saccade.services.planner.motion import STEP_M, reach, step_towards, turn_towards, way_around
 from saccade.services.planner.oracle import Oracle
-from saccade.services.simulator.objects import YCB_NAMES, load_mesh, ycb_folder
 from saccade.services.simulator.scenes import PAPER_SCENES, generate_split, load_scenes
 from saccade.shared.bus.messages import Truth
 from saccade.shared.bus.wire import encode
+from saccade.shared.render.objects import YCB_NAMES, load_mesh, ycb_folder
 from saccade.shared.world.geometry import look_at, rotation_angle, rotation_xyz
 from saccade.shared.world.task import LOWER_M, UPPER_M, Episode, Spheres, apply_action, clip, spheres_around, start_pose
 

@@ -6,10 +6,10 @@ import torch
 
 from saccade.services.perception.core import SceneCCN
 from saccade.services.perception.cropping import Cropper
-from saccade.services.simulator.objects import load_mesh, names_of
-from saccade.services.simulator.world import World
 from saccade.shared.config import WEIGHTS
 from saccade.shared.model.weights import Weights
+from saccade.shared.render.objects import load_mesh, names_of
+from saccade.shared.render.world import World
 from saccade.shared.world.geometry import INTRINSICS_PX, direction, look_at, project
 from saccade.shared.world.windows import Window
 

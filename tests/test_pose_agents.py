@@ -15,14 +15,14 @@ from saccade.app.run.run import run
 from saccade.services.perception.posecnn import hough_center, network_input, rotation_of
 from saccade.services.perception.templates import TemplateMatcher
 from saccade.services.planner.follow import Follower, goal_view
-from saccade.services.simulator.objects import load_mesh
-from saccade.services.simulator.world import World
 from saccade.shared.bus.messages import Percept
 from saccade.shared.bus.topics import STATUS
 from saccade.shared.config import Config
 from saccade.shared.errors import SaccadeError
 from saccade.shared.log.reading import RunReader
 from saccade.shared.model.weights import Weights
+from saccade.shared.render.objects import load_mesh
+from saccade.shared.render.world import World
 from saccade.shared.world.geometry import (
     INTRINSICS_PX,
     direction,

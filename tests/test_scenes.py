@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from saccade.services.simulator import scenes as scenes_module
-from saccade.services.simulator.objects import YCB_NAMES
 from saccade.services.simulator.scenes import (
     PAPER_SCENES,
     generate_scene,
@@ -19,6 +18,7 @@ from saccade.services.simulator.scenes import (
 )
 from saccade.shared.errors import SaccadeError
 from saccade.shared.files import MAX_VALUES
+from saccade.shared.render.objects import YCB_NAMES
 from saccade.shared.world.geometry import rotation_angle, rotation_towards
 from saccade.shared.world.task import LOWER_M, UPPER_M, spheres_around
 

@@ -10,13 +10,13 @@ import pytest
 from PIL import Image
 
 from saccade.services.simulator.core import SERVICE, Simulator, build, scenes_of
-from saccade.services.simulator.objects import load_mesh, names_in_use
 from saccade.services.simulator.scenes import generate_scene, save_scenes
-from saccade.services.simulator.world import World
 from saccade.shared.bus.messages import Action
 from saccade.shared.bus.wire import decode, encode
 from saccade.shared.config import Config
 from saccade.shared.errors import SaccadeError
+from saccade.shared.render.objects import load_mesh, names_in_use
+from saccade.shared.render.world import World
 from saccade.shared.world.geometry import look_at
 from saccade.shared.world.images import read_goal_image
 from saccade.shared.world.task import start_pose

@@ -7,11 +7,11 @@ import ctypes.util
 import numpy as np
 import pytest
 
-from saccade.services.simulator.mesh import Mesh
-from saccade.services.simulator.objects import load_mesh, names_of, ycb_folder
-from saccade.services.simulator.opengl import choose_backend
-from saccade.services.simulator.world import FAR_M, World
 from saccade.shared.errors import SaccadeError
+from saccade.shared.render.mesh import Mesh
+from saccade.shared.render.objects import load_mesh, names_of, ycb_folder
+from saccade.shared.render.opengl import choose_backend
+from saccade.shared.render.world import FAR_M, World
 from saccade.shared.world.geometry import INTRINSICS_PX, look_at, pixel_rays, project
 
 TABLE_RGB = (37, 201, 118)

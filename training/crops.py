@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from saccade.services.simulator.views import ObjectViews
+from saccade.shared.render.views import ObjectViews
 from saccade.shared.world.windows import CROP_PX
 from saccade.training.strangers import strangers
 

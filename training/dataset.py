@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from saccade.services.simulator.objects import load_mesh
-from saccade.services.simulator.views import ObjectViews, default_shells_m, render_views
 from saccade.shared.errors import SaccadeError
 from saccade.shared.files import writing
+from saccade.shared.render.objects import load_mesh
+from saccade.shared.render.views import ObjectViews, default_shells_m, render_views
 from saccade.training.settings import TrainingConfig
 
 

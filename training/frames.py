@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from saccade.services.perception.networks import INPUT_PX, MASK_PX
-from saccade.services.simulator.views import TILE_PX, ObjectViews
+from saccade.shared.render.views import TILE_PX, ObjectViews
 from saccade.shared.world.geometry import (
     IMAGE_SIZE_PX,
     INTRINSICS_PX,

@@ -12,8 +12,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from saccade.services.perception.paper import PaperExtraction
-from saccade.services.simulator.views import ObjectViews
 from saccade.shared.model.generative_model import CCN, kl_divergence
+from saccade.shared.render.views import ObjectViews
 from saccade.shared.world.windows import CROP_PX
 from saccade.training.ccn import loss_l1, sample_pair, wrapped
 from saccade.training.extraction import HIDDEN, SEEN, errors

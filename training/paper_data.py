@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from saccade.services.perception.paper import CANVAS_PX, CROP_SIDE_M
-from saccade.services.simulator.views import TILE_PX, ObjectViews
+from saccade.shared.render.views import TILE_PX, ObjectViews
 from saccade.shared.world.windows import CROP_PX
 from saccade.training.crops import REFERENCE_SHELL, warp
 from saccade.training.frames import FrameBatch

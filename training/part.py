@@ -36,8 +36,11 @@ SMOOTHING = 0.99  # of the running mean of the losses
 class Task(Protocol):
     """What is trained: networks, and what they learn at each step."""
 
-    module: nn.Module
     lambdas: list[float]  # weights of the loss that adapt; they are kept in checkpoints
+
+    @property
+    def module(self) -> nn.Module:
+        """The networks."""
 
     def loss(self, step: int) -> tuple[Tensor, dict[str, float]]:
         """The loss at a step, and its parts."""

@@ -17,8 +17,8 @@ from saccade.services.perception.posecnn import (
     region_side,
     rotation_of,
 )
-from saccade.services.simulator.objects import load_mesh
-from saccade.services.simulator.views import crop_side_m
+from saccade.shared.render.objects import load_mesh
+from saccade.shared.render.views import crop_side_m
 from saccade.shared.world.geometry import IMAGE_SIZE_PX, INTRINSICS_PX
 from saccade.training.pictures import draw_poses
 from saccade.training.rendered import RenderedBatch, RenderedScenes
@@ -29,6 +29,7 @@ POINTS = 100  # points of each mesh in the loss of the rotation
 SEEN_CELLS = 8  # an object that is seen in fewer cells of the map of labels teaches no rotation
 VOTING, ROTATION = 2.0, 4.0  # weights of the losses beside that of the labels
 JITTER = 0.08  # of the regions in training, in shares of their side: as wrong as the votes' centres
+FOCAL_WIDTHS = INTRINSICS_PX[0] / IMAGE_SIZE_PX  # the focal length in image widths
 EVALUATED = 100  # number of images in an evaluation
 
 
@@ -77,8 +78,7 @@ class PoseCnnTask:
         """
         image, which = found.T
         center, log_scale = batch.center[image, which], batch.log_scale[image, which]
-        side = self.sides_m[which] * log_scale.exp() * region_side(1.0, 1.0, INTRINSICS_PX[0] / IMAGE_SIZE_PX)
-        side = side.float()
+        side = self.sides_m[which].float() * log_scale.exp() * float(region_side(1.0, 1.0, FOCAL_WIDTHS))
         if generator is not None:
             noise = torch.randn(len(found), 3, generator=generator, device=self.device) * JITTER
             center, side = center + noise[:, :2] * side[:, None], side * noise[:, 2].exp()

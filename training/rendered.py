@@ -10,8 +10,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from saccade.services.perception.posecnn import INPUT_PX, LABEL_PX, network_input
-from saccade.services.simulator.mesh import Mesh
-from saccade.services.simulator.world import World
+from saccade.shared.render.mesh import Mesh
+from saccade.shared.render.world import World
 from saccade.shared.world.geometry import (
     IMAGE_SIZE_PX,
     INTRINSICS_PX,

@@ -15,11 +15,11 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from saccade.services.perception.paper import CROP_SIDE_M
-from saccade.services.simulator.objects import load_mesh
-from saccade.services.simulator.views import crop_side_m
 from saccade.shared.errors import SaccadeError
 from saccade.shared.files import replace_whole, writing
 from saccade.shared.model.weights import ObjectCard, write_weights
+from saccade.shared.render.objects import load_mesh
+from saccade.shared.render.views import crop_side_m
 from saccade.training.checkpoints import ccn_of, finished
 from saccade.training.dataset import render_missing
 from saccade.training.part import pick_device

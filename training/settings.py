@@ -63,7 +63,7 @@ class TrainingConfig(Section):
     @model_validator(mode="before")
     @classmethod
     def _defaults(cls, given: Any) -> Any:
-        return {**DEFAULTS.get(given.get("architecture"), {}), **given} if isinstance(given, dict) else given
+        return {**DEFAULTS.get(str(given.get("architecture")), {}), **given} if isinstance(given, dict) else given
 
     @model_serializer(mode="wrap")
     def _tree(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:

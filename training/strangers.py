@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from saccade.services.simulator.views import TILE_PX, ObjectViews
+from saccade.shared.render.views import TILE_PX, ObjectViews
 from saccade.shared.world.geometry import REFERENCE_RANGE_M, fibonacci_hemisphere
 
 Array = NDArray[np.float64]

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from saccade.services.perception.networks import Extraction, Identity
-from saccade.services.simulator.views import ObjectViews
 from saccade.shared.model.generative_model import CCN
+from saccade.shared.render.views import ObjectViews
 from saccade.training.ccn import LAMBDA_EVERY, adapt, goal_search_errors, identity_loss, loss_l1, sample_pair
 from saccade.training.crops import CropComposer
 from saccade.training.extraction import extraction_errors, loss_l2

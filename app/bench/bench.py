@@ -26,7 +26,6 @@ from saccade.app.bench.workers import in_processes
 from saccade.app.provenance import machine, shown
 from saccade.app.run.display import say
 from saccade.app.run.registry import Pair, local_pairs, weight_hashes
-from saccade.services.simulator.objects import names_in_use
 from saccade.services.simulator.scenes import Scene, load_scenes
 from saccade.shared.bus.messages import Message, Result
 from saccade.shared.bus.topics import Topic
@@ -35,6 +34,7 @@ from saccade.shared.errors import SaccadeError
 from saccade.shared.files import MIB, append_line, parse_json, read_text, replace_whole, writing
 from saccade.shared.log.provenance import commit
 from saccade.shared.loop.local import run_local
+from saccade.shared.render.objects import names_in_use
 
 MAX_FILE_BYTES = 256 * MIB  # of results: some hundred thousand scenes
 SCENES_ENDING = ".scenes.json"  # drawn scenes are kept in a file with this ending

@@ -9,7 +9,6 @@ from typing import Literal
 
 import numpy as np
 
-from saccade.services.simulator.objects import load_mesh, names_in_use
 from saccade.services.simulator.scenes import (
     PAPER_SCENES,
     Scene,
@@ -21,6 +20,7 @@ from saccade.services.simulator.scenes import (
 )
 from saccade.shared.config import Config
 from saccade.shared.errors import SaccadeError
+from saccade.shared.render.objects import load_mesh, names_in_use
 
 Yaw = Literal["random", "fixed"]
 

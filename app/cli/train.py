@@ -35,8 +35,8 @@ def train(*, objects: Objects = None, names: Names = None,
     """Train the networks of an object set. The same command continues after an interruption."""
     from rich.console import Console
 
-    from saccade.services.simulator.objects import names_in_use
     from saccade.shared.config import WEIGHTS, SceneConfig
+    from saccade.shared.render.objects import names_in_use
     from saccade.training.run import export
     from saccade.training.run import train as run_training
     from saccade.training.settings import settings_from

@@ -16,7 +16,6 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from saccade.app.palette import COLOURS
-from saccade.services.simulator.world import TABLE_SIDE_M
 from saccade.shared.bus.messages import Belief, Frame, Goal, Message, Plan, Result, Truth
 from saccade.shared.bus.topics import BELIEF, FRAME, GOAL, PLAN, RESULT, TRUTH
 from saccade.shared.config import recorded
@@ -24,6 +23,7 @@ from saccade.shared.errors import SaccadeError
 from saccade.shared.files import replace_whole, writing
 from saccade.shared.log.folder import LOG_NAME, PICTURE_NAME
 from saccade.shared.log.reading import RunReader
+from saccade.shared.render.world import TABLE_SIDE_M
 
 INCHES, DPI = (21.0, 5.2), 100
 SHOWN_M = 0.62  # half the side of the view from above, which shows the table and the camera's workspace

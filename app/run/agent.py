@@ -11,13 +11,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from saccade.app.run.registry import DEFAULT_AGENT, agent_pairs
 from saccade.services.camera.virtual_camera import VirtualCamera
-from saccade.services.simulator.objects import names_in_use
 from saccade.shared.bus.messages import Action, Belief, Frame, Goal, Message, Percept, Plan
 from saccade.shared.bus.topics import ACTION, BELIEF, FRAME, GOAL, GOAL_PERCEPT, PERCEPT, PLAN, Output, Topic
 from saccade.shared.config import Config
 from saccade.shared.errors import SaccadeError
 from saccade.shared.loop.local import Pump
 from saccade.shared.loop.stepper import Stepper
+from saccade.shared.render.objects import names_in_use
 from saccade.shared.world.geometry import IMAGE_SIZE_PX, INTRINSICS_PX
 from saccade.shared.world.images import read_image
 

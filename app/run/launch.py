@@ -16,7 +16,6 @@ from typing import Protocol
 from saccade.app.run.halt import Pulse
 from saccade.app.run.supervisor import Process, Supervisor
 from saccade.services.recorder.core import complete
-from saccade.services.simulator.objects import names_of
 from saccade.shared.bus.messages import Message, Result, Status
 from saccade.shared.bus.sequences import Sequences
 from saccade.shared.bus.topics import PLAN, RESULT, STATUS, Topic
@@ -28,6 +27,7 @@ from saccade.shared.log.folder import CONFIG_NAME, LOG_NAME, LOGS_NAME
 from saccade.shared.log.reading import is_whole
 from saccade.shared.loop.main import READY_STATES
 from saccade.shared.loop.process import Item
+from saccade.shared.render.objects import names_of
 
 Told = tuple[Topic, str | None, Message]
 OnMessage = Callable[[Topic, str | None, Message], None]

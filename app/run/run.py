@@ -22,7 +22,6 @@ from saccade.app.run.supervisor import VIEWER
 from saccade.services.camera.core import build as build_camera
 from saccade.services.camera.sources import absolute, webcam_number
 from saccade.services.recorder.core import describe, to_be_finished
-from saccade.services.simulator.objects import names_in_use
 from saccade.services.viewer.server import binary, url_of, with_free_ports
 from saccade.shared.bus.messages import Message, Result
 from saccade.shared.bus.topics import Topic
@@ -32,6 +31,7 @@ from saccade.shared.files import writing
 from saccade.shared.log.folder import CONFIG_NAME, LOG_NAME
 from saccade.shared.log.recording import FINISHED, RecordingStopped, RunLog
 from saccade.shared.loop.local import run_local
+from saccade.shared.render.objects import names_in_use
 
 MANIFEST_NAME = "manifest.json"
 

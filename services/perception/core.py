@@ -43,7 +43,7 @@ class Found:
     crop_masks: torch.Tensor
     window: Window
     presence: NDArray[np.float64]
-    deviation: NDArray[np.float32]
+    deviation: NDArray[np.float64]
     side_px: NDArray[np.float64]
     mask_bits: NDArray[np.uint8]
 

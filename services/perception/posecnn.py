@@ -131,7 +131,9 @@ class PoseCNN:
     def __init__(self, weights: Weights, names: tuple[str, ...]):
         self.cards = weights.cards_of(names)
         self.rows = [weights.names.index(name) for name in names]
-        self.network = weights.fill(PoseNetwork(len(weights.names)), "posecnn")
+        network = weights.fill(PoseNetwork(len(weights.names)), "posecnn")
+        assert isinstance(network, PoseNetwork)  # it is what was filled
+        self.network = network
         self.pixel_std, self.log_scale_std = (
             np.array([weights.calibration.get(f"{name}.{what}", otherwise) for name in names])
             for what, otherwise in (("pixel_std", PIXEL_STD), ("log_scale_std", LOG_SCALE_STD)))

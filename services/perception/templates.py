@@ -19,11 +19,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from saccade.services.perception.core import SERVICE, Perception, SceneCCN
 from saccade.services.perception.seen import Seen
-from saccade.services.simulator.objects import load_mesh
-from saccade.services.simulator.world import World
 from saccade.shared.config import Config
 from saccade.shared.errors import SaccadeError
 from saccade.shared.model.weights import ObjectCard, Weights
+from saccade.shared.render.objects import load_mesh
+from saccade.shared.render.world import World
 from saccade.shared.world.geometry import (
     REFERENCE_RANGE_M,
     direction,

@@ -8,15 +8,15 @@ from typing import Literal, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from saccade.services.simulator.objects import load_mesh, names_in_use
 from saccade.services.simulator.scenes import Placed, Scene, Sizes, generate_scene, load_scenes
-from saccade.services.simulator.world import World
 from saccade.shared.bus.messages import Frame, Goal, Truth
 from saccade.shared.bus.topics import ACTION, FRAME, GOAL, RESULT, TRUTH, Output
 from saccade.shared.config import Config
 from saccade.shared.errors import SaccadeError
 from saccade.shared.loop.seeding import generator
 from saccade.shared.loop.service import Inputs, Service
+from saccade.shared.render.objects import load_mesh, names_in_use
+from saccade.shared.render.world import World
 from saccade.shared.world.images import read_goal_image
 from saccade.shared.world.task import MAX_STEPS, Episode, spheres_around
 

@@ -16,12 +16,12 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from saccade.services.simulator.core import Simulator
-from saccade.services.simulator.objects import load_mesh, names_in_use
 from saccade.services.simulator.scenes import Scene, generate_scene, load_scenes
-from saccade.services.simulator.world import World
 from saccade.shared.bus.messages import Action, Frame
 from saccade.shared.config import SceneConfig
 from saccade.shared.errors import SaccadeError
+from saccade.shared.render.objects import load_mesh, names_in_use
+from saccade.shared.render.world import World
 from saccade.shared.world.geometry import IMAGE_SIZE_PX
 from saccade.shared.world.task import ACTION_LIMIT, MAX_STEPS, errors
 

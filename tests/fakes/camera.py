@@ -9,9 +9,9 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from saccade.services.simulator.objects import load_mesh, names_of
-from saccade.services.simulator.world import World
 from saccade.shared.errors import SaccadeError
+from saccade.shared.render.objects import load_mesh, names_of
+from saccade.shared.render.world import World
 from saccade.shared.world.geometry import direction, look_at
 
 HERE = look_at([0.4, 0.1, 0.3], [0.0, 0.0, 0.05])

@@ -8,10 +8,10 @@ import torch
 
 from saccade.services.perception.networks import Extraction, Identity
 from saccade.services.perception.posecnn import PoseNetwork
-from saccade.services.simulator.objects import load_mesh
-from saccade.services.simulator.views import crop_side_m
 from saccade.shared.model.generative_model import CCN
 from saccade.shared.model.weights import ObjectCard, write_weights
+from saccade.shared.render.objects import load_mesh
+from saccade.shared.render.views import crop_side_m
 
 
 def write_random_weights(folder: Path, object_set: str, names: tuple[str, ...], architecture: str = "default") -> None:

@@ -9,10 +9,10 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from saccade.services.simulator.mesh import Mesh, read_obj
-from saccade.services.simulator.pantry import PANTRY_NAMES, make_mesh
 from saccade.shared.config import SceneConfig
 from saccade.shared.errors import SaccadeError
+from saccade.shared.render.mesh import Mesh, read_obj
+from saccade.shared.render.pantry import PANTRY_NAMES, make_mesh
 
 YCB_NAMES = ("002_master_chef_can", "003_cracker_box", "004_sugar_box", "005_tomato_soup_can", "006_mustard_bottle")
 

@@ -7,9 +7,9 @@ import weakref
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from saccade.services.simulator.mesh import Mesh
-from saccade.services.simulator.opengl import HOW_TO_MEND, choose_backend
 from saccade.shared.errors import SaccadeError
+from saccade.shared.render.mesh import Mesh
+from saccade.shared.render.opengl import HOW_TO_MEND, choose_backend
 from saccade.shared.world.geometry import IMAGE_SIZE_PX, INTRINSICS_PX
 
 choose_backend()

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from saccade.services.simulator.mesh import Mesh
-from saccade.services.simulator.world import World
+from saccade.shared.render.mesh import Mesh
+from saccade.shared.render.world import World
 from saccade.shared.world.geometry import REFERENCE_RANGE_M, direction, fibonacci_hemisphere, look_at
 
 RENDER_PX, TILE_PX = 256, 128

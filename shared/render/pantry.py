@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from saccade.services.simulator.mesh import Mesh
+from saccade.shared.render.mesh import Mesh
 
 PANTRY_NAMES = ("coffee_can", "cereal_box", "rice_box", "soup_can", "squeeze_bottle")
 ATLAS_PX = 1024
