@@ -99,6 +99,23 @@ def draw_gallery(cases: Sequence[tuple[str, Story]], out: Path) -> None:
     save(figure, out)
 
 
+def draw_final_views(stories: Mapping[str, Sequence[Story]], out: Path) -> None:
+    """Draws a row of goals, and below it, for each agent, a row of the last views that it reached."""
+    goals = next(iter(stories.values()))
+    figure = new_figure((0.6 + 1.3 * len(goals), 1.5 * (1 + len(stories))))
+    grid = figure.subplots(1 + len(stories), len(goals), squeeze=False)
+    for axes, story in zip(grid[0], goals, strict=True):
+        image(axes, story.goal_rgb, "")
+    for row, (agent, reached) in zip(grid[1:], stories.items(), strict=True):
+        for axes, story in zip(row, reached, strict=True):
+            success = story.result is not None and story.result.success
+            image(axes, story.last_rgb, "reached" if success else "")
+            axes.title.set_fontsize(7)
+    for name, row in zip(("goal", *stories), grid, strict=True):
+        row[0].text(-0.08, 0.5, name, transform=row[0].transAxes, rotation=90, fontsize=8, ha="right", va="center")
+    save(figure, out)
+
+
 @dataclass
 class Exploration:
     """An episode without a goal. `beliefs` holds what was believed about each object, by the number of views."""

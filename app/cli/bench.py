@@ -18,10 +18,12 @@ from saccade.app.cli.options import (
     command_line,
     wide,
 )
-from saccade.app.cli.texts import configured
+from saccade.app.cli.texts import configured, split_names
 from saccade.shared.errors import SaccadeError
 
 app = typer.Typer()
+Cluster = Annotated[str | None, typer.Option(
+    metavar="ADDRESS", help="Use a Ray cluster instead of --jobs, such as ray://host:10001.")]
 
 
 @app.command()
@@ -32,8 +34,7 @@ def bench(*, objects: Objects = None, scenes: ScenesFile = None,
           agent: Annotated[str, typer.Option(help=f"Which agent to measure: {AGENTS}.")] = "sceneccn",
           limit: Annotated[int | None, typer.Option(min=1, help="Run only so many scenes, chosen evenly.")] = None,
           jobs: Annotated[int, typer.Option(min=1, help="How many processes work at a time.")] = 1,
-          cluster: Annotated[str | None, typer.Option(
-              metavar="ADDRESS", help="Use a Ray cluster instead of --jobs, such as ray://host:10001.")] = None,
+          cluster: Cluster = None,
           json: Annotated[Path | None, typer.Option(
               help="File for the results.", show_default="bench/<agent>_<set>[_<suite>].json")] = None,
           yaw: Annotated[Literal["random", "fixed"] | None, typer.Option(
@@ -74,3 +75,21 @@ def report(*, results: Annotated[list[Path], typer.Argument(
     from saccade.app.bench.report import report as write_report
 
     write_report(results, out, failures=failures, reruns=not no_reruns, weights=weights, jobs=jobs, console=Console())
+
+
+@app.command()
+def table(*, out: Annotated[Path, typer.Option(help="Folder of the page and of the results.")],
+          objects: Objects = None,
+          agents: Annotated[str | None, typer.Option(
+              metavar="NAMES", help="Only these agents, such as posecnn,lexa.", show_default="all")] = None,
+          limit: Annotated[int | None, typer.Option(
+              min=1, help="Run only so many scenes of each suite, chosen evenly.")] = None,
+          jobs: Annotated[int, typer.Option(min=1, help="How many processes work at a time.")] = 1,
+          cluster: Cluster = None) -> None:
+    """Compare all agents of the paper, and others, on its suites. The same command continues after an interruption."""
+    from rich.console import Console
+
+    from saccade.app.bench.comparison import compare
+
+    compare(out, objects or "ycb", agents=split_names(agents), limit=limit, jobs=jobs, cluster=cluster,
+            command=command_line(), console=wide(Console()))

@@ -42,12 +42,13 @@ DEFAULT_WORLD = "simulator"
 class Agent:
     """What an agent consists of: `services` are processes of their own, `cores` are modules that run only within one
     process. `preset` is the configuration that makes it this agent: other networks, other modules in the services'
-    places."""
+    places. `knows` says what it works with."""
 
     services: tuple[str, ...] = ()
     cores: tuple[str, ...] = ()
     preset: str | None = None
     weights: bool = True  # whether it needs trained weights
+    knows: str = "RGB, camera pose"
 
 
 DEFAULT_AGENT = "sceneccn"
@@ -55,11 +56,13 @@ ALL_THREE = ("perception", "belief", "planner")
 AGENTS = {
     "sceneccn": Agent(ALL_THREE),
     "paper": Agent(ALL_THREE, preset="paper"),
-    "posecnn": Agent(("perception", "planner"), preset="posecnn"),
-    "posecnn-infogain": Agent(ALL_THREE, preset="posecnn-infogain"),
-    "render-and-compare": Agent(ALL_THREE, preset="render-and-compare"),
-    "lexa": Agent(("planner",), preset="lexa"),
-    "oracle": Agent(cores=("saccade.services.planner.oracle",), weights=False),
+    "posecnn": Agent(("perception", "planner"), preset="posecnn", knows="RGB, depth, camera pose"),
+    "posecnn-infogain": Agent(ALL_THREE, preset="posecnn-infogain", knows="RGB, depth, camera pose"),
+    "render-and-compare": Agent(ALL_THREE, preset="render-and-compare", knows="RGB, camera pose, meshes"),
+    "lexa": Agent(("planner",), preset="lexa", knows="RGB"),
+    "random-walk": Agent(("planner",), preset="random-walk", weights=False, knows="nothing"),
+    "still": Agent(("planner",), preset="still", weights=False, knows="nothing"),
+    "oracle": Agent(cores=("saccade.services.planner.oracle",), weights=False, knows="the goal's pose"),
 }
 
 

@@ -123,6 +123,7 @@ class Perception:
 
     def __init__(self, make: Callable[[tuple[str, ...]], Model], names: tuple[str, ...]):
         self._make = make
+        self._last: tuple[Frame, Seen] | None = None  # where the camera stands still, nothing is inferred twice
         self.share(names)
 
     def share(self, names: tuple[str, ...]) -> None:
@@ -130,7 +131,7 @@ class Perception:
 
         Raises SaccadeError if the weights do not serve them.
         """
-        self.names, self.goal_told = names, False
+        self.names, self.goal_told, self._last = names, False, None
         self.model = self._make(names) if names else None
 
     def begin(self, run: str, episode: int) -> Iterable[Output]:
@@ -147,10 +148,15 @@ class Perception:
         if not self.goal_told:
             self.goal_told = True
             yield from self._goal(model, inputs["goal"])
-        up = frame.world_from_camera[2, :3]
-        seen = model.see(frame.rgb, frame.intrinsics_px, up, frame.depth_m)
+        seen = self._seen(model, frame)
         for k, name in enumerate(self.names):
             yield Output(PERCEPT, percept(frame, name, seen, k, frame.world_from_camera), name)
+
+    def _seen(self, model: Model, frame: Frame) -> Seen:
+        if self._last is None or not _same_view(self._last[0], frame):
+            up = frame.world_from_camera[2, :3]
+            self._last = frame, model.see(frame.rgb, frame.intrinsics_px, up, frame.depth_m)
+        return self._last[1]
 
     def _goal(self, model: Model, goal: Goal) -> Iterable[Output]:
         """The percepts of the goal image. Without a goal image the presence of every object is 0."""
@@ -162,6 +168,12 @@ class Perception:
             seen = model.see(goal.rgb, goal.intrinsics_px, (0.0, 1.0, 0.0))
         for k, name in enumerate(self.names):
             yield Output(GOAL_PERCEPT, percept(goal, name, seen, k, np.eye(4)), name)
+
+
+def _same_view(a: Frame, b: Frame) -> bool:
+    """Whether two frames show the same from the same place. The depth then is the same, too."""
+    return (np.array_equal(a.world_from_camera, b.world_from_camera)
+            and np.array_equal(a.intrinsics_px, b.intrinsics_px) and np.array_equal(a.rgb, b.rgb))
 
 
 def percept(source: Frame | Goal, name: str, seen: Seen, k: int, world_from_camera: NDArray) -> Percept:

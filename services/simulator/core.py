@@ -45,6 +45,8 @@ class Simulator:
         self.world, self.scenes, self.max_steps = world, tuple(scenes), max_steps
         self.publish_depth, self.goal_rgb, self.explore = publish_depth, goal_rgb, explore
         self.until = "declared" if goal_rgb is not None else until
+        # Camera pose, image and depth of the last frame. Where the camera stands still, nothing is rendered again.
+        self._shown: tuple[NDArray[np.float64], NDArray[np.uint8], NDArray[np.float32] | None] | None = None
 
     @property
     def episodes(self) -> int:
@@ -85,6 +87,7 @@ class Simulator:
 
     def _place(self, objects: Sequence[Placed]) -> None:
         self.world.place({p.name: (p.center_m, p.yaw_rad) for p in objects}, self.scene.table_rgb)
+        self._shown = None
 
     def _goal_image(self) -> NDArray[np.uint8] | None:
         """The goal image [H, W, 3]: the user's, or the target alone on the table, rendered from the goal's pose.
@@ -104,9 +107,12 @@ class Simulator:
 
     def _frame(self) -> Frame:
         camera = self.state.camera
-        depth = self.world.render_depth(camera) if self.publish_depth else None
-        return Frame(**self._stamp(), rgb=self.world.render(camera), intrinsics_px=self.world.intrinsics_px,
-                     world_from_camera=camera, depth_m=depth)
+        if self._shown is None or not np.array_equal(self._shown[0], camera):
+            depth = self.world.render_depth(camera) if self.publish_depth else None
+            self._shown = camera, self.world.render(camera), depth
+        _, rgb, depth = self._shown
+        return Frame(**self._stamp(), rgb=rgb, intrinsics_px=self.world.intrinsics_px, world_from_camera=camera,
+                     depth_m=depth)
 
     def _truth(self) -> Truth:
         scene, state, present = self.scene, self.state, self.scene.on_table

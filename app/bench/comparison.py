@@ -1,0 +1,189 @@
+"""`saccade table` compares all agents: it runs the benchmarks that are not there yet, and writes the paper's tables.
+
+The results of each agent on each suite are a file of `saccade bench` in the folder `results`. A file that holds the
+wanted scenes of the same agent is taken as it is; an interrupted benchmark goes on.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from rich.console import Console
+
+from saccade.app.bench.bench import MATTERS, Plan, bench, facts, prepare
+from saccade.app.bench.charts import draw_errors, draw_final_views
+from saccade.app.bench.repeat import Results, prepare_again, read_results, replay
+from saccade.app.bench.table import MEASURES, PAPER_AGENTS, PAPER_ROOM, Row, milliseconds, rows, summarise
+from saccade.app.look.picture import Story
+from saccade.app.run.display import say
+from saccade.app.run.registry import AGENTS, agent_of
+from saccade.shared.config import Config, load
+from saccade.shared.errors import SaccadeError
+from saccade.shared.files import replace_whole, writing
+from saccade.shared.model.weights import Weights
+
+ROOM = "lexa-room"
+SUITES_OF = {"ycb": ("paper-500", "yaw-500", ROOM), "pantry": ("paper-like", "paper-like-yaw", ROOM)}
+COMPARED = ("sceneccn", "paper", "posecnn", "posecnn-infogain", "render-and-compare")  # on all suites
+IN_THE_ROOM = ("lexa", "random-walk", "still")  # in the room only: one was trained there, the others know nothing
+PAPERS_NAMES = {"paper": "SceneCCN + AIF", "posecnn": "PoseCNN (uses depth)", "posecnn-infogain": "PoseCNN + Infogain"}
+PAPERS_ROOM = {"paper": "SceneCCN", "posecnn": "PoseCNN", "posecnn-infogain": "PoseCNN + Infogain",
+               "lexa": "LEXA (about 7 M steps)"}
+GOALS_SHOWN = 10  # columns of the picture of final views
+PAGE, FOLDER = "table.md", "results"
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One agent on one suite, and the file of its results."""
+
+    agent: str
+    suite: str
+    path: Path
+
+
+def cells(out: Path, objects: str, agents: Sequence[str] | None) -> list[Cell]:
+    """All that is compared, suite by suite. Raises SaccadeError if an agent is unknown or has no place in the table."""
+    known = (*COMPARED, *IN_THE_ROOM)
+    for agent in agents or ():
+        agent_of(agent)
+        if agent not in known:
+            raise SaccadeError(f"agent {agent!r} is not in the table: choose from {', '.join(known)}")
+    chosen = [agent for agent in known if agents is None or agent in agents]
+    return [Cell(agent, suite, out / FOLDER / f"{agent}_{objects}_{suite}.json")
+            for suite in SUITES_OF[objects] for agent in chosen if suite == ROOM or agent in COMPARED]
+
+
+def compare(out: Path, objects: str, *, agents: Sequence[str] | None = None, limit: int | None = None, jobs: int = 1,
+            cluster: str | None = None, command: str = "saccade table", console: Console) -> list[Path]:
+    """Runs what is missing, and writes the page with its pictures. Returns the results files.
+
+    Raises SaccadeError if the weights of an agent are missing or do not serve it; what was measured before is kept.
+    """
+    wanted = cells(out, objects, agents)
+    with writing(out, "table"):
+        (out / FOLDER).mkdir(parents=True, exist_ok=True)
+    plans = {cell: prepare(cell.agent, _configuration(cell.agent, objects), cell.path, suite=cell.suite, limit=limit)
+             for cell in wanted}  # all of them first, so that what is missing is told soon
+    for cell, plan in plans.items():
+        if not _is_there(plan, command):
+            say(console, f"{cell.agent} on {cell.suite}")
+            bench(plan, jobs=jobs, command=command, console=console, cluster=cluster)
+    write_page(out, {cell: read_results(cell.path) for cell in wanted}, console)
+    return [cell.path for cell in wanted]
+
+
+def _is_there(plan: Plan, command: str) -> bool:
+    """Whether the results of a plan are there: of the same agent, weights and scenes, and all that are wanted."""
+    if not plan.out.is_file():
+        return False
+    results, origin = read_results(plan.out), facts(plan, command)
+    held = {record["scene"] for record in results.records}
+    same = all(results.facts[key] == origin[key] for key in MATTERS)
+    return same and held >= {plan.scenes[number].id for number in plan.chosen}
+
+
+def _configuration(agent: str, objects: str) -> Config:
+    return load(None, AGENTS[agent].preset).with_values({"scene.objects": objects})
+
+
+def write_page(out: Path, found: dict[Cell, Results], console: Console) -> None:
+    """Writes table.md and its pictures from results files."""
+    lines = ["# All agents, side by side", "",
+             "Success with Wilson's 95 % interval; errors of the last view, mean ± standard error; milliseconds per "
+             "step of perception, belief and planner together. The paper's figures stand below ours.", ""]
+    for suite in dict.fromkeys(cell.suite for cell in found):
+        mine = {cell.agent: results for cell, results in found.items() if cell.suite == suite}
+        lines += [f"## {suite}", "", *table_of(suite, mine), ""]
+        picture = out / f"errors_{suite}.png"
+        draw_errors([replace(results, label=agent) for agent, results in mine.items()], picture)
+        lines += [f"![Errors of azimuth, elevation and range on {suite}]({picture.name})", ""]
+        if suite != ROOM:
+            lines += [*by_target(mine), ""]
+    lines += ["## What each agent has", "", *budgets(found), ""]
+    room = {cell.agent: results for cell, results in found.items() if cell.suite == ROOM}
+    if room:
+        draw_final_views(_final_views(room, console), out / "final_views.png")
+        lines += ["## The views that were reached in the room", "",
+                  "![The goals, and below them the last view of each agent](final_views.png)", ""]
+    with writing(out / PAGE, "table"):
+        replace_whole(out / PAGE, ("\n".join(lines).rstrip() + "\n").encode())
+    say(console, f"written to {out / PAGE}")
+
+
+def table_of(suite: str, results: dict[str, Results]) -> list[str]:
+    """The table of one suite: a row for each agent, and below it the paper's row."""
+    lines = ["| agent | scenes | success | " + " | ".join(MEASURES.values()) + " | median steps | ms per step |",
+             "| --- | --- | --- |" + " --- |" * (len(MEASURES) + 2)]
+    for agent, of in results.items():
+        row = rows(of.records)[-1]
+        spent = milliseconds(of.records)
+        agents_ms = sum(spent.get(service, 0.0) for service in ("perception", "belief", "planner"))
+        lines.append(f"| **{agent}** | {row.scenes} | {_share(row)} | {_means(row)} | {row.median_steps:g} | "
+                     f"{agents_ms:.0f} |")
+        if suite == ROOM and agent in PAPERS_ROOM:
+            lines.append(f"| paper: {PAPERS_ROOM[agent]} | 100 | {PAPER_ROOM[PAPERS_ROOM[agent]]} % | | | | | |")
+        elif suite == "paper-500" and agent in PAPERS_NAMES:
+            theirs = PAPER_AGENTS[PAPERS_NAMES[agent]]
+            means = " | ".join(f"{mean:.3f} ± {error:.3f}"
+                               for mean, error in zip(theirs.means, theirs.errors or (), strict=True))
+            lines.append(f"| paper: {PAPERS_NAMES[agent]} | 500 | {theirs.success_percent:.1f} % | {means} | | |")
+    return lines
+
+
+def by_target(results: dict[str, Results]) -> list[str]:
+    """The share of successes (%) of each agent for each target."""
+    targets = list(dict.fromkeys(r["target"] for of in results.values() for r in of.records))
+    lines = ["| success for each target | " + " | ".join(targets) + " |", "| --- |" + " --- |" * len(targets)]
+    for agent, of in results.items():
+        each = [[r for r in of.records if r["target"] == target] for target in targets]
+        shares = [f"{100 * summarise(t, records).success.value:.0f} %" if records else "-"
+                  for t, records in zip(targets, each, strict=True)]
+        lines.append(f"| {agent} | " + " | ".join(shares) + " |")
+    return lines
+
+
+def budgets(found: dict[Cell, Results]) -> list[str]:
+    """What each agent works with, and how its networks were trained."""
+    lines = ["| agent | works with | trained |", "| --- | --- | --- |"]
+    for agent, of in {cell.agent: results for cell, results in found.items()}.items():
+        lines.append(f"| {agent} | {AGENTS[agent].knows} | {_training(agent, of.objects)} |")
+    return lines
+
+
+def _training(agent: str, objects: str) -> str:
+    if not AGENTS[agent].weights:
+        return "not at all"
+    manifest = Weights(_configuration(agent, objects).weights).manifest
+    said = [str(manifest[key]) for key in ("data",) if key in manifest]
+    if "seconds" in manifest:
+        said.append(f"{float(manifest['seconds']) / 3600:.1f} hours on {manifest.get('where_trained', 'unknown')}")
+    return "; ".join(said) or "unknown"
+
+
+def _share(row: Row) -> str:
+    share = row.success
+    return f"{100 * share.value:.1f} % ({100 * share.low:.1f} to {100 * share.high:.1f})"
+
+
+def _means(row: Row) -> str:
+    return " | ".join(f"{mean.value:.3f}" + (f" ± {mean.standard_error:.3f}" if mean.standard_error else "")
+                      for mean in row.means)
+
+
+def _final_views(room: dict[str, Results], console: Console) -> dict[str, list[Story]]:
+    """The last views of every agent for goals of the room that all of them have, spread evenly. The episodes are run
+    again."""
+    everyone = [{r["scene"] for r in of.records} for of in room.values()]
+    common = [r["scene"] for r in next(iter(room.values())).records if all(r["scene"] in one for one in everyone)]
+    count = min(GOALS_SHOWN, len(common))
+    chosen = [common[k * len(common) // count] for k in range(count)]
+    stories: dict[str, list[Story]] = {}
+    with tempfile.TemporaryDirectory() as folder, console.status("running ten goals again"):
+        for agent, of in room.items():
+            again = prepare_again(of, Path(folder))
+            stories[agent] = [replay(*again.arguments(scene)) for scene in chosen]
+    return stories

@@ -1,0 +1,54 @@
+"""`saccade table`: all agents side by side, resumed where it was cut, with the paper's figures below ours."""
+
+import io
+import json
+
+import pytest
+from rich.console import Console
+
+from saccade.app.bench import comparison
+from saccade.app.bench.comparison import cells, compare
+from saccade.app.bench.table import PAPER_AGENTS, PAPER_ROOM
+from saccade.shared.errors import SaccadeError
+
+AGENTS = ("random-walk", "still")
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    out = tmp_path_factory.mktemp("table")
+    compare(out, "pantry", agents=AGENTS, limit=2, console=Console(file=io.StringIO()))
+    return out
+
+
+def test_the_page_has_a_row_for_each_agent_and_its_pictures(written):
+    page = (written / "table.md").read_text()
+    assert page.count("**random-walk**") == page.count("**still**") == 1
+    assert "| **still** | 2 | 0.0 % (0.0 to 65.8) |" in page
+    assert "| still | nothing | not at all |" in page
+    for picture in ("errors_lexa-room.png", "final_views.png"):
+        assert picture in page
+        assert (written / picture).stat().st_size > 5000
+
+
+def test_what_is_there_is_not_run_again_and_more_scenes_are(written, monkeypatch):
+    run = []
+    real = comparison.bench
+    monkeypatch.setattr(comparison, "bench", lambda plan, **how: run.append(plan.agent) or real(plan, **how))
+    compare(written, "pantry", agents=AGENTS, limit=2, console=Console(file=io.StringIO()))
+    assert run == []
+    compare(written, "pantry", agents=("still",), limit=3, console=Console(file=io.StringIO()))
+    assert run == ["still"]
+    results = json.loads((written / "results" / "still_pantry_lexa-room.json").read_text())
+    assert len(results["results"]) == 3
+
+
+def test_every_agent_of_the_paper_has_its_rows(tmp_path):
+    everyone = cells(tmp_path, "ycb", None)
+    assert len({cell.path for cell in everyone}) == len(everyone) == 3 * 5 + 3
+    assert set(comparison.PAPERS_NAMES.values()) == PAPER_AGENTS.keys()
+    assert set(comparison.PAPERS_ROOM.values()) == PAPER_ROOM.keys()
+    with pytest.raises(SaccadeError, match="'oracle' is not in the table"):
+        cells(tmp_path, "ycb", ["oracle"])
+    with pytest.raises(SaccadeError, match="'nobody' is unknown"):
+        cells(tmp_path, "ycb", ["nobody"])
