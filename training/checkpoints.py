@@ -26,6 +26,11 @@ def read_checkpoint(path: Path) -> tuple[dict, dict[str, Tensor]]:
         raise SaccadeError(f"checkpoint {path} is damaged ({error}): remove it to train this part anew") from error
 
 
+def step_of(path: Path) -> int:
+    """The step of a checkpoint, 0 if there is none. Raises SaccadeError if it is damaged."""
+    return int(read_checkpoint(path)[0]["step"]) if path.is_file() else 0
+
+
 def model_of(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     """The tensors of the networks in a checkpoint, without those of the optimiser."""
     return {k.removeprefix("model."): v for k, v in tensors.items() if k.startswith("model.")}

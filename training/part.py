@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from saccade.shared.errors import SaccadeError
 from saccade.shared.files import append_line, replace_whole, writing
 from saccade.shared.log.provenance import commit
-from saccade.training.checkpoints import CHECKPOINT, ccn_of, model_of, read_checkpoint
+from saccade.training.checkpoints import CHECKPOINT, ccn_of, model_of, read_checkpoint, step_of
 from saccade.training.dataset import load_views
 from saccade.training.paper import PaperCcnTask, PaperExtractionTask
 from saccade.training.settings import TrainingConfig, load_settings
@@ -84,6 +84,10 @@ def task_of(run_dir: Path, config: TrainingConfig, part: str, device: torch.devi
         from saccade.training.posecnn import PoseCnnTask  # here, because it loads the simulator
 
         return PoseCnnTask(config, device)
+    if config.architecture == "lexa":
+        from saccade.training.lexa.task import LexaTask
+
+        return LexaTask(config, part, device, run_dir / part, step_of(run_dir / part / CHECKPOINT))
     views = [load_views(run_dir, name) for name in config.names]
     extraction = config.is_extraction(part)
     if config.architecture == "default":

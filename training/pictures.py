@@ -21,7 +21,7 @@ _LABEL_COLOURS = torch.rand(256, 3, generator=torch.Generator().manual_seed(1)) 
 _LABEL_COLOURS[0] = 0.0
 
 
-def _save(path: Path, rows: list[Tensor]) -> None:
+def draw_rows(path: Path, rows: list[Tensor]) -> None:
     """Saves rows of images [N, 3, H, W] in [0, 1], one below the other, twice as large."""
     strips = [torch.cat(list(row.float().cpu().clamp(0, 1)), dim=2) for row in rows]
     picture = (torch.cat(strips, dim=1).permute(1, 2, 0).numpy() * 255).astype(np.uint8)
@@ -33,7 +33,8 @@ def draw_ccn(path: Path, ccn: CCN, pair: Pair) -> None:
     """Draws rows: input | masked crop | reconstruction | prediction after the transition | true view after it."""
     mean, _ = ccn.encoder(pair.first.masked)
     moved, _ = ccn.transition(mean, pair.displacement)
-    _save(path, [pair.first.rgb, pair.first.masked[:, :3], ccn.decoder(mean), ccn.decoder(moved), pair.second.target])
+    drawn = [ccn.decoder(mean), ccn.decoder(moved)]
+    draw_rows(path, [pair.first.rgb, pair.first.masked[:, :3], *drawn, pair.second.target])
 
 
 @torch.inference_mode()
@@ -41,7 +42,7 @@ def draw_paper_extraction(path: Path, network: PaperExtraction, batch: FrameBatc
     """Draws rows: input | true mask | predicted mask | masked crop | true crop (`clean` [B, 3, 64, 64])."""
     mask, _, _, crop, _ = network(batch.image)
     rows = (batch.image, batch.mask.expand(-1, 3, -1, -1), mask.expand(-1, 3, -1, -1), crop[:, :3], clean)
-    _save(path, [F.interpolate(row, size=batch.image.shape[-2:]) for row in rows])
+    draw_rows(path, [F.interpolate(row, size=batch.image.shape[-2:]) for row in rows])
 
 
 @torch.inference_mode()
@@ -60,11 +61,11 @@ def draw_extraction(path: Path, network: Extraction, batch: FrameBatch) -> None:
         u, v = (center[b, k] * size[0]).round().long().clamp(2, size[0] - 3).tolist()
         marked[b, :, v, u - 2:u + 3] = 1.0
         marked[b, :, v - 2:v + 3, u] = 1.0
-    _save(path, [marked, true, seen])
+    draw_rows(path, [marked, true, seen])
 
 
 def draw_poses(path: Path, batch: RenderedBatch, labels: Tensor) -> None:
     """Draws rows: input | true labels | predicted labels. `labels` are their logits [B, K + 1, 80, 80]."""
     size = batch.input.shape[-2:]
     shown = [_LABEL_COLOURS[label.cpu()].permute(0, 3, 1, 2) for label in (batch.label, labels.argmax(1))]
-    _save(path, [batch.input[:, :3], *(F.interpolate(row, size=size) for row in shown)])
+    draw_rows(path, [batch.input[:, :3], *(F.interpolate(row, size=size) for row in shown)])

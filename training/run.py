@@ -23,7 +23,7 @@ from saccade.shared.render.views import crop_side_m
 from saccade.training.checkpoints import ccn_of, finished
 from saccade.training.dataset import render_missing
 from saccade.training.part import pick_device
-from saccade.training.settings import EXTRACTION, POSES, TrainingConfig, load_settings
+from saccade.training.settings import EXTRACTION, WHOLE, TrainingConfig, load_settings
 
 
 def start(run_dir: Path, config: TrainingConfig) -> TrainingConfig:
@@ -58,7 +58,7 @@ def train(run_dir: Path, config: TrainingConfig, *, jobs: int, console: Console)
                 bars[name] = progress.add_task(name, total=total, note="")
             progress.update(bars[name], completed=done, note=note)
 
-        if config.architecture != "posecnn":  # which renders its own images
+        if config.architecture not in WHOLE:  # which render their own images
             render_missing(run_dir, config, lambda name, done, total: show(f"views {name}", done, total))
         _train_parts(run_dir, config, jobs, show)
 
@@ -108,6 +108,9 @@ def export(run_dir: Path, weights_dir: Path) -> None:
     states, losses, commits, seconds = {}, {}, {}, 0.0
     for part in config.parts:
         facts, states[part] = finished(run_dir, config, part)
+        if config.architecture == "lexa":  # what only training needs stays behind
+            states[part] = {name.removeprefix("actor."): value for name, value in states[part].items()
+                            if name.startswith("actor.")}
         losses[part] = json.loads((run_dir / part / "losses.jsonl").read_text().splitlines()[-1])
         commits[part] = facts.get("commit", "unknown")
         seconds += facts["seconds"]
@@ -120,10 +123,11 @@ def export(run_dir: Path, weights_dir: Path) -> None:
     cards = tuple(ObjectCard(name, size, CROP_SIDE_M if paper else crop_side_m(size)) for name, size in sizes.items())
     data = f"{config.views} directions of each object of {config.objects!r}, from {{}}, composed"
     described = {"default": data.format("four ranges"), "paper": data.format("0.40 m"),
-                 "posecnn": f"images of the objects of {config.objects!r}, rendered at every step"}
+                 "posecnn": f"images of the objects of {config.objects!r}, rendered at every step",
+                 "lexa": f"one room with the objects of {config.objects!r}, lived in"}
     write_weights(weights_dir, states, cards, {
-        **({} if config.architecture == "default" else {"architecture": config.architecture,
-                                                        "calibration": _calibration(config, losses)}),
+        **({} if config.architecture == "default" else {"architecture": config.architecture}),
+        **({"calibration": _calibration(config, losses)} if config.architecture in ("paper", "posecnn") else {}),
         "data": described[config.architecture],
         "training": config.model_dump(mode="json"), "losses": losses, "commits": commits,
         "where_trained": _where(pick_device(config.device)), "seconds": round(seconds), "torch": torch.__version__})
@@ -135,7 +139,7 @@ def _calibration(config: TrainingConfig, losses: dict[str, dict]) -> dict[str, f
     They are those of Gaussians with the median errors that were measured on held-out views.
     """
     if config.architecture == "posecnn":
-        measured = {name: {key: losses[POSES][f"{name}.{key}"] for key in ("centre_px", "log_scale")}
+        measured = {name: {key: losses["posecnn"][f"{name}.{key}"] for key in ("centre_px", "log_scale")}
                     for name in config.names}
     else:
         measured = {name: losses[f"{name}.{EXTRACTION}"] for name in config.names}

@@ -13,7 +13,8 @@ from saccade.shared.errors import SaccadeError
 from saccade.shared.files import parse_json, read_text
 from saccade.shared.model.weights import Architecture
 
-EXTRACTION, POSES = "extraction", "posecnn"  # names of parts
+EXTRACTION = "extraction"  # name of a part
+WHOLE = ("posecnn", "lexa")  # architectures of one part, which has the same name
 # Default settings for the paper's networks. Batches and rates are the paper's (appendix C), but there are fewer steps:
 # the paper's 5,000 epochs of 450 views are 15,000 and 25,000 steps.
 PAPER = {"steps_ccn": 5_000, "steps_extraction": 6_000, "batch_ccn": 150, "batch_extraction": 50,
@@ -21,7 +22,9 @@ PAPER = {"steps_ccn": 5_000, "steps_extraction": 6_000, "batch_ccn": 150, "batch
 
 # The defaults of PoseCNN. It has one network for all objects, which counts as phase 2.
 POSECNN = {"steps_extraction": 12_000, "batch_extraction": 16, "rate_extraction": 1e-3}
-DEFAULTS: dict[str, dict[str, Any]] = {"paper": PAPER, "posecnn": POSECNN}
+# The defaults of LEXA: a batch is pieces of 25 images; an episode of 50 steps is lived through every 20 steps.
+LEXA = {"steps_extraction": 20_000, "batch_extraction": 16, "rate_extraction": 2e-4}
+DEFAULTS: dict[str, dict[str, Any]] = {"paper": PAPER, "posecnn": POSECNN, "lexa": LEXA}
 OF_OTHERS = ("architecture", "kl_extraction", "guide_extraction", "ccns", "symmetric")
 
 
@@ -78,13 +81,13 @@ class TrainingConfig(Section):
         """The parts of the run. Each part is trained by one process."""
         if self.architecture == "paper":
             return (*(() if self.ccns else self.names), *(f"{name}.{EXTRACTION}" for name in self.names))
-        if self.architecture == "posecnn":
-            return (POSES,)
+        if self.architecture in WHOLE:
+            return (self.architecture,)
         return (EXTRACTION, *self.names)
 
     def is_extraction(self, part: str) -> bool:
         """Whether a part belongs to phase 2."""
-        return part.rpartition(".")[2] in (EXTRACTION, POSES)
+        return part.rpartition(".")[2] in (EXTRACTION, *WHOLE)
 
     def needs(self, part: str) -> str | None:
         """The part that must be finished before this one begins, or None.

@@ -106,7 +106,7 @@ def draw_final_views(stories: Mapping[str, Sequence[Story]], out: Path) -> None:
     grid = figure.subplots(1 + len(stories), len(goals), squeeze=False)
     for axes, story in zip(grid[0], goals, strict=True):
         image(axes, story.goal_rgb, "")
-    for row, (agent, reached) in zip(grid[1:], stories.items(), strict=True):
+    for row, reached in zip(grid[1:], stories.values(), strict=True):
         for axes, story in zip(row, reached, strict=True):
             success = story.result is not None and story.result.success
             image(axes, story.last_rgb, "reached" if success else "")

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
-
-import numpy as np
 
 from saccade.services.simulator.scenes import (
     PAPER_SCENES,
     Scene,
     Sizes,
-    draw_goal,
-    generate_scene,
     generate_split,
+    room_scenes,
     save_scenes,
 )
 from saccade.shared.config import Config
@@ -24,9 +21,8 @@ from saccade.shared.render.objects import load_mesh, names_in_use
 
 Yaw = Literal["random", "fixed"]
 
-YAW_SEED, ROOM_SEED = 31_415_000, 27_182_000
+YAW_SEED = 31_415_000
 DEV_SEEDS: dict[Yaw, int] = {"fixed": 57_721_000, "random": 57_722_000}  # of the halves without and with turned objects
-ROOM_GOALS = 20  # goals of each target
 DEV_REPEATS = 2  # repeats in each half
 
 
@@ -43,19 +39,6 @@ def _split(sizes: Sizes, seed: int, yaw: Yaw, repeats: int = 20) -> list[Scene]:
     return generate_split(sizes, seed=seed, counts=range(1, len(sizes) + 1), repeats=repeats, yaw=yaw)
 
 
-def _room(sizes: Sizes, _seed: int) -> list[Scene]:
-    """One table with all objects, never turned, and goals by the paper's rule. It repeats the paper's comparison with
-    LEXA."""
-    rng, names = np.random.default_rng(ROOM_SEED), tuple(sizes)
-    room = generate_scene(rng, sizes, names[0], len(names), yaw="fixed")
-    present = [placed.name for placed in room.objects]
-    centers = [p.center_m for p in room.objects]
-    extents = np.array([sizes[name] for name in present], dtype=np.float64)
-    return [replace(room, id=f"lexa-{ROOM_GOALS * k + goal}", target=target,
-                    goal_world_from_camera=draw_goal(rng, centers, extents, present.index(target)))
-            for k, target in enumerate(names) for goal in range(ROOM_GOALS)]
-
-
 def _dev(sizes: Sizes, _seed: int) -> list[Scene]:
     """The scenes for tuning. No other scenes are used for it."""
     return [scene for yaw, seed in DEV_SEEDS.items() for scene in _split(sizes, seed, yaw, DEV_REPEATS)]
@@ -64,7 +47,7 @@ def _dev(sizes: Sizes, _seed: int) -> list[Scene]:
 SUITES = {
     "paper-500": Suite(file=PAPER_SCENES, objects="ycb"),
     "yaw-500": Suite(lambda sizes, _seed: _split(sizes, YAW_SEED, "random")),
-    "lexa-room": Suite(_room),
+    "lexa-room": Suite(lambda sizes, _seed: room_scenes(sizes)),
     "dev": Suite(_dev),
     "paper-like": Suite(lambda sizes, seed: _split(sizes, seed, "fixed")),
     "paper-like-yaw": Suite(lambda sizes, seed: _split(sizes, seed, "random")),

@@ -26,9 +26,9 @@ def train(*, objects: Objects = None, names: Names = None,
           seed: Seed = None, jobs: Annotated[int, typer.Option(
               min=1, help="How many networks are trained at a time.")] = 1,
           device: Annotated[Literal["auto", "cpu", "cuda"] | None, typer.Option(show_default="auto")] = None,
-          architecture: Annotated[Literal["default", "paper", "posecnn"], typer.Option(
-              help="Saccade's networks, those of the paper's tables, or PoseCNN. Others than Saccade's go to folders "
-                   "named <set>-<architecture>.")] = "default",
+          architecture: Annotated[Literal["default", "paper", "posecnn", "lexa"], typer.Option(
+              help="Saccade's networks, those of the paper's tables, PoseCNN, or LEXA. Others than Saccade's go to "
+                   "folders named <set>-<architecture>.")] = "default",
           weights: WeightsFolder = None, values: Annotated[list[str] | None, typer.Option(
               "--set", metavar="KEY=VALUE", help="Set a training setting, such as batch_ccn=64 (see "
                                                  "training/settings.py).")] = None) -> None:

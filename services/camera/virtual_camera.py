@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from saccade.shared.errors import SaccadeError
+from saccade.shared.errors import SaccadeError, told
 from saccade.shared.world.geometry import IMAGE_SIZE_PX, INTRINSICS_PX
 from saccade.shared.world.images import Size
 
@@ -66,9 +66,12 @@ class VirtualCamera:
 
     def __init__(self, size_px: Size, intrinsics_px: Sequence[float] | None = None):
         self.size_px = size_px
-        fx, fy, cx, cy = assumed_intrinsics(size_px) if intrinsics_px is None else intrinsics_px
-        name = f"intrinsics ({fx:g}, {fy:g}, {cx:g}, {cy:g}) px"
         need = "give fx, fy, cx, cy of images of this size"
+        try:
+            fx, fy, cx, cy = map(float, assumed_intrinsics(size_px) if intrinsics_px is None else intrinsics_px)
+        except (TypeError, ValueError) as error:
+            raise SaccadeError(f"intrinsics {told(intrinsics_px)} are not four numbers: {need}") from error
+        name = f"intrinsics ({fx:g}, {fy:g}, {cx:g}, {cy:g}) px"
         if not (np.isfinite([fx, fy, cx, cy]).all() and min(fx, fy) > 0):
             raise SaccadeError(f"{name}: not finite, or a focal length that is not positive: {need}")
         width, height = size_px

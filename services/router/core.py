@@ -20,7 +20,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 def _work(config: Config, folder: Path, inbox: Inbox) -> None:
     bus = ZenohBus(config.bus.listen or config.bus.endpoint, world=config.bus.world, listen=True)
     try:
-        health = Health(NAME, at=(folder.name, 0, 0))
+        health = Health(NAME, at=(config.run or folder.name, 0, 0))
         with Heartbeat(bus, health, inbox.stop):
             health.say("ready")
             for _ in inbox.items(drain_s=0.0):

@@ -22,7 +22,7 @@ from saccade.shared.config import SceneConfig
 from saccade.shared.errors import SaccadeError
 from saccade.shared.render.objects import load_mesh, names_in_use
 from saccade.shared.render.world import World
-from saccade.shared.world.geometry import IMAGE_SIZE_PX
+from saccade.shared.world.geometry import IMAGE_SIZE_PX, INTRINSICS_PX
 from saccade.shared.world.task import ACTION_LIMIT, MAX_STEPS, errors
 
 ID = "saccade/ActiveSearch-v0"
@@ -32,11 +32,11 @@ Observation = dict[str, Any]  # name -> array
 class ActiveSearch(gymnasium.Env[Observation, NDArray[np.float64]]):
     """An environment in which a camera moves until it sees the goal image (paper, section 4.1).
 
-    The observation has `image` and `goal` [480, 480, 3] uint8, and `pose`, which is world_from_camera [4, 4] (metres).
-    An action [6] is a translation (metres) along the axes of the world and a rotation about its fixed axes x, y and z
-    (radians). Each number is between -0.5 and 0.5. The reward is 1 in the step that reaches the goal (within 0.075 m
-    and 0.5 rad), otherwise 0. This step terminates the episode. The episode is truncated after `max_steps`. `info`
-    holds the id of the scene and the errors in azimuth, elevation and range.
+    The observation has `image` and `goal` [size_px, size_px, 3] uint8, and `pose`, which is world_from_camera [4, 4]
+    (metres). An action [6] is a translation (metres) along the axes of the world and a rotation about its fixed axes x,
+    y and z (radians). Each number is between -0.5 and 0.5. The reward is 1 in the step that reaches the goal (within
+    0.075 m and 0.5 rad), otherwise 0. This step terminates the episode. The episode is truncated after `max_steps`.
+    `info` holds the id of the scene and the errors in azimuth, elevation and range.
 
     Every reset draws a scene with the environment's random generator. With a file `scenes` it draws one of the file's
     scenes, or takes the one that reset's options name (`scene=<id>`). Without a file it draws a new scene with
@@ -49,14 +49,15 @@ class ActiveSearch(gymnasium.Env[Observation, NDArray[np.float64]]):
     def __init__(self, *, objects: Literal["pantry", "ycb"] = "pantry", names: Sequence[str] | None = None,
                  n_objects: int | None = None, yaw: Literal["random", "fixed"] = "random",
                  scenes: str | Path | None = None,
-                 max_steps: int = MAX_STEPS, render_mode: str | None = None):
-        image = spaces.Box(0, 255, (IMAGE_SIZE_PX, IMAGE_SIZE_PX, 3), np.uint8)
+                 max_steps: int = MAX_STEPS, size_px: int = IMAGE_SIZE_PX, render_mode: str | None = None):
+        image = spaces.Box(0, 255, (size_px, size_px, 3), np.uint8)
         self.observation_space = spaces.Dict(
             {"image": image, "goal": image, "pose": spaces.Box(-1.0, 1.0, (4, 4), np.float64)})
         self.action_space = spaces.Box(-ACTION_LIMIT, ACTION_LIMIT, (6,), np.float64)
         self.render_mode, self.yaw, self.n_objects, self.max_steps = render_mode, yaw, n_objects, max_steps
         in_use = names_in_use(SceneConfig(objects=objects, names=tuple(names) if names is not None else None))
-        self._world = World(tuple(load_mesh(objects, name) for name in in_use))
+        self._world = World(tuple(load_mesh(objects, name) for name in in_use), size_px=size_px,
+                            intrinsics_px=np.array(INTRINSICS_PX) * size_px / IMAGE_SIZE_PX)
         self._file = {scene.id: scene for scene in load_scenes(Path(scenes), in_use)} if scenes is not None else {}
         self._simulator: Simulator | None = None
 
@@ -103,7 +104,7 @@ class ActiveSearch(gymnasium.Env[Observation, NDArray[np.float64]]):
         return {"image": image, "goal": self._goal.copy(), "pose": simulator.state.camera.copy()}
 
     def render(self) -> NDArray[np.uint8] | None:
-        """The camera's image [480, 480, 3] in the render mode `rgb_array`, otherwise None."""
+        """The camera's image [size_px, size_px, 3] in the render mode `rgb_array`, otherwise None."""
         return self._image if self.render_mode == "rgb_array" else None
 
     def close(self) -> None:

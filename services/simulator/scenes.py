@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence, Set
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any, Literal
@@ -29,6 +29,7 @@ GOAL_RANGE_MAX_M = 0.50
 MAX_FILE_BYTES, MAX_SCENES = 64 * MIB, 20_000
 MAX_ID = 256  # characters of an id or a name: it is in messages and in file names
 MAX_NUMBERS = {"center_xyz_m": 10.0, "goal_world_from_camera": 10.0, "yaw_rad": 1e4}  # what is further is not seen
+ROOM_SEED, ROOM_GOALS = 27_182_000, 20  # of the suite lexa-room: its seed, and the number of goals of each target
 _NEED = "give a scenes file"
 _TRIES = 100  # attempts to place an object before all objects are placed anew, and how often this is done
 
@@ -266,3 +267,16 @@ def overlapping(scene: Scene, sizes: Sizes) -> list[tuple[str, str]]:
     radius = {p.name: np.linalg.norm(np.asarray(sizes[p.name], dtype=np.float64)[:2]) / 2 for p in scene.objects}
     return [(a.name, b.name) for a, b in combinations(scene.objects, 2)
             if np.linalg.norm((a.center_m - b.center_m)[:2]) < radius[a.name] + radius[b.name] - 1e-9]
+
+
+def room_scenes(sizes: Sizes) -> list[Scene]:
+    """One table with all objects, never turned, and goals by the paper's rule. It repeats the paper's comparison with
+    LEXA."""
+    rng, names = np.random.default_rng(ROOM_SEED), tuple(sizes)
+    room = generate_scene(rng, sizes, names[0], len(names), yaw="fixed")
+    present = [placed.name for placed in room.objects]
+    centers = [p.center_m for p in room.objects]
+    extents = np.array([sizes[name] for name in present], dtype=np.float64)
+    return [replace(room, id=f"lexa-{ROOM_GOALS * k + goal}", target=target,
+                    goal_world_from_camera=draw_goal(rng, centers, extents, present.index(target)))
+            for k, target in enumerate(names) for goal in range(ROOM_GOALS)]

@@ -27,7 +27,7 @@ from saccade.shared.files import MIB, parse_json, read_bytes, read_text, replace
 if TYPE_CHECKING:
     from torch import nn
 
-Architecture = Literal["default", "paper", "posecnn"]
+Architecture = Literal["default", "paper", "posecnn", "lexa"]
 WITH_LATENTS = ("default", "paper")  # architectures with a CCN for each object
 
 MANIFEST = "manifest.json"

@@ -1,0 +1,159 @@
+"""LEXA: it lives in one room, learns a world model, and its achiever is a planner; and two agents that know nothing."""
+
+import io
+import json
+
+import numpy as np
+import pytest
+import torch
+from rich.console import Console
+
+from saccade.app.cli.texts import configured
+from saccade.app.run.run import run
+from saccade.services.planner.lexa import Actor, StateSpaceModel, likeliest
+from saccade.services.simulator.gym_env import ActiveSearch
+from saccade.services.simulator.scenes import room_scenes
+from saccade.shared.bus.messages import Action, Frame
+from saccade.shared.bus.topics import STATUS
+from saccade.shared.errors import SaccadeError
+from saccade.shared.log.reading import RunReader
+from saccade.shared.model.weights import MANIFEST, Weights
+from saccade.shared.render.objects import load_mesh
+from saccade.tests.fakes.training import assert_same_checkpoint, interrupt_and_resume
+from saccade.tests.fakes.weights import write_random_weights
+from saccade.training.lexa.behaviour import achiever_loss, explorer_loss, returns
+from saccade.training.lexa.replay import Episode, Replay
+from saccade.training.lexa.world_model import Learner, distance_loss, divergence, observe
+from saccade.training.part import Trainer
+from saccade.training.run import export, start
+from saccade.training.settings import TrainingConfig
+
+NAMES = ("soup_can", "rice_box")
+EPISODE = {"scene.names": list(NAMES), "scene.n_objects": 2, "simulator.max_steps": 4, "seed": 4}
+TINY = TrainingConfig(objects="pantry", names=NAMES, steps_extraction=4, batch_extraction=2, checkpoint_every=2,
+                      device="cpu", architecture="lexa")
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """Two tiny runs, one of them interrupted after its first checkpoint."""
+    folder = tmp_path_factory.mktemp("runs")
+    for name in ("whole", "resumed"):
+        start(folder / name, TINY)
+    Trainer(folder / "whole", "lexa").train()
+    interrupt_and_resume(folder / "resumed", "lexa", before_step=3)
+    export(folder / "whole", folder / "weights")
+    return folder
+
+
+def test_training_continues_as_if_it_had_not_been_interrupted(finished):
+    assert_same_checkpoint(finished / "whole", finished / "resumed", "lexa")
+    weights = Weights(finished / "weights")
+    assert (weights.architecture, weights.names) == ("lexa", NAMES)
+    weights.fill(Actor(), "lexa")  # what only training needs is not in them
+    assert json.loads((finished / "weights" / MANIFEST).read_text())["losses"]["lexa"]["environment_steps"] >= 400
+
+
+def test_the_goals_of_the_suite_are_not_lived_in(finished):
+    """The environment has the suite's room; its episodes' images show all objects, and no goal is among them."""
+    sizes = {name: load_mesh("pantry", name).size_m for name in NAMES}
+    room = room_scenes(sizes)
+    assert len(room) == 2 * 20
+    kept = json.loads((finished / "whole" / "lexa" / "room.json").read_text())["scenes"]
+    assert [scene["id"] for scene in kept] == [room[0].id]
+    with ActiveSearch(objects="pantry", names=NAMES, size_px=64) as environment:
+        assert environment.reset(seed=1)[0]["image"].shape == (64, 64, 3)
+
+
+def test_an_episode_that_ended_early_is_kept_and_not_learnt_from(tmp_path):
+    replay, rng = Replay(tmp_path, 0), np.random.default_rng(0)
+    for length, shade in ((3, 0), (6, 200)):
+        replay.add(Episode(np.full((length + 1, 64, 64, 3), shade, np.uint8), np.full((length, 6), 0.5, np.float32)))
+    drawn = Replay(tmp_path, 2).sequences(8, 5, rng, CPU)
+    assert drawn.images.unique().tolist() == [pytest.approx(200 / 255)]
+    assert drawn.actions.shape == (8, 5, 6)
+    assert set(drawn.actions[:, 0].unique().tolist()) == {0.0, 0.5}  # before the first image of an episode: none
+    (tmp_path / "00001.npz").write_bytes(b"no episode")
+    with pytest.raises(SaccadeError, match=r"00001.npz is missing or damaged"):
+        Replay(tmp_path, 2)
+
+
+def test_lambda_returns_by_hand():
+    rewards, worth = torch.tensor([[1.0], [2.0]]), torch.tensor([[9.0], [10.0], [20.0]])
+    last = 2.0 + 0.95 * 20.0
+    first = 1.0 + 0.95 * (0.05 * 10.0 + 0.95 * last)
+    assert returns(rewards, worth)[:, 0].tolist() == pytest.approx([first, last])
+
+
+def test_policies_learn_and_the_world_model_does_not_learn_from_them():
+    torch.manual_seed(0)
+    learner, generator = Learner(), torch.Generator().manual_seed(0)
+    encodings, actions = torch.randn(2, 6, 256), torch.randn(2, 6, 6).tanh()
+    states, posterior, prior = observe(learner.actor.model, encodings, actions, generator)
+    assert states.feature.shape == (2, 6, 456)
+    assert float(divergence(posterior, posterior).detach().abs().max()) == 0.0
+    assert float(divergence(posterior, prior).detach().min()) > 0.0
+    begin = type(states)(*(part.detach().flatten(0, 1) for part in states))
+    explorer_loss(learner, begin, generator)[0].backward()
+    achiever_loss(learner, begin, torch.randn(12, 256), generator)[0].backward()
+    learnt = {name.split(".")[0] if not name.startswith("actor.") else name.split(".")[1]
+              for name, value in learner.named_parameters() if value.grad is not None and value.grad.abs().sum() > 0}
+    assert learnt == {"explorer", "achiever", "worth_explored", "worth_achieved"}
+
+
+def test_the_distance_learns_how_far_apart_images_are():
+    """On encodings that say where in their sequence they are, and in which one."""
+    torch.manual_seed(0)
+    learner, generator = Learner(), torch.Generator().manual_seed(0)
+    encodings = torch.zeros(4, 9, 256)
+    encodings[:, :, 0], encodings[:, :, 1] = torch.arange(4)[:, None], torch.linspace(0, 4, 9)
+    optimizer = torch.optim.Adam(learner.distance.parameters(), lr=2e-3)
+    losses = []
+    for _ in range(150):
+        loss = distance_loss(learner, encodings, generator)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(float(loss.detach()))
+    assert np.mean(losses[-10:]) < 0.3 * losses[0]
+
+
+def test_the_state_is_a_fold_over_images_and_actions():
+    torch.manual_seed(0)
+    model = StateSpaceModel().eval()
+    deterministic, prior = model(model.initial(1), torch.zeros(1, 6))
+    assert prior.exp().sum(-1).detach().numpy() == pytest.approx(1.0, abs=1e-5)
+    sample = likeliest(model.observe(deterministic, torch.randn(1, 256)))
+    assert sample.sum() == 16
+    assert model(type(model.initial(1))(deterministic, sample), torch.ones(1, 6))[0].shape == (1, 200)
+
+
+@pytest.mark.parametrize("agent", ["lexa", "random-walk", "still"])
+def test_an_agent_runs_on_the_bus_and_in_one_process_alike(agent, tmp_path, finished):
+    logs = {}
+    given = {"perception.weights": finished / "weights"} if agent == "lexa" else {}
+    for kind in ("zenoh", "local"):
+        config = configured(None, EPISODE | {"bus.kind": kind} | given, [], agent)
+        run(config, agent=agent, out=tmp_path / kind / "same", plain=True, console=Console(file=io.StringIO()))
+        logs[kind] = [entry.payload for entry in RunReader(tmp_path / kind / "same" / "run.mcap").entries()
+                      if entry.topic != STATUS]
+    assert sorted(logs["zenoh"]) == sorted(logs["local"])
+    messages = [message for _, _, message in RunReader(tmp_path / "local" / "same" / "run.mcap")]
+    moves = [np.linalg.norm(message.translation_m) for message in messages if isinstance(message, Action)]
+    views = [message.world_from_camera for message in messages if isinstance(message, Frame)]
+    assert len(moves) == 4
+    if agent == "still":
+        assert moves == [0.0] * 4
+        assert all(np.array_equal(view, views[0]) for view in views)
+    elif agent == "random-walk":
+        assert moves == [pytest.approx(0.05)] * 4
+    else:
+        assert 0.0 < max(moves) < 0.08 * 3 ** 0.5
+
+
+def test_weights_of_another_architecture_get_one_line(tmp_path, finished):
+    write_random_weights(tmp_path / "w", "pantry", NAMES)
+    config = configured(None, EPISODE | {"bus.kind": "local", "perception.weights": tmp_path / "w"}, [], "lexa")
+    with pytest.raises(SaccadeError, match=r"architecture 'default', and this agent needs 'lexa'"):
+        run(config, agent="lexa", out=tmp_path / "r", plain=True, console=Console(file=io.StringIO()))

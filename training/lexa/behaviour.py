@@ -1,0 +1,105 @@
+"""Explorer and achiever learn in imagination: the policies act in the world model, which stays as it is meanwhile."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+from torch.func import functional_call
+
+from saccade.services.planner.lexa import Policy, State
+from saccade.training.lexa.world_model import Learner, distance_of, sampled
+
+HORIZON = 12
+DISCOUNT, LAMBDA = 0.95, 0.95
+ENTROPY = 1e-3
+
+
+class Imagined(NamedTuple):
+    """An imagined way: features [H + 1, B, 456], and the actions between them [H, B, 6] with their entropy [H, B]."""
+
+    features: Tensor
+    actions: Tensor
+    entropy: Tensor
+
+
+class Frozen:
+    """A network that gradients pass through, but that does not learn."""
+
+    def __init__(self, network: nn.Module) -> None:
+        self.network = network
+        self.values = {name: value.detach() for name, value in network.named_parameters()}
+
+    def __call__(self, *inputs):
+        return functional_call(self.network, self.values, inputs)
+
+
+def squashed(policy: Policy, inputs: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """A sample of an action [B, 6] with its gradient, and the entropy [B] of the distribution before it is
+    squashed."""
+    mean, std = policy(inputs)
+    noise = torch.randn(mean.shape, generator=generator, device=mean.device)
+    return torch.tanh(mean + std * noise), std.log().sum(-1)
+
+
+def imagine(learner: Learner, start: State, act: Callable[[Tensor], tuple[Tensor, Tensor]],
+            generator: torch.Generator) -> Imagined:
+    """Acts for HORIZON steps from states [B, ...] of the world model."""
+    model = Frozen(learner.actor.model)
+    state, features = start, [start.feature]
+    actions: list[Tensor] = []
+    entropy: list[Tensor] = []
+    for _ in range(HORIZON):
+        action, spread = act(state.feature)
+        deterministic, prior = model(state, action)
+        state = State(deterministic, sampled(prior, generator))
+        for values, value in ((features, state.feature), (actions, action), (entropy, spread)):
+            values.append(value)
+    return Imagined(torch.stack(features), torch.stack(actions), torch.stack(entropy))
+
+
+def returns(rewards: Tensor, worth: Tensor) -> Tensor:
+    """The lambda-returns [H, B] of rewards [H, B] after each action, where states are worth `worth` [H + 1, B]."""
+    last, result = worth[-1], []
+    for reward, value in zip(rewards.flip(0), worth[1:].flip(0), strict=True):
+        last = reward + DISCOUNT * ((1 - LAMBDA) * value + LAMBDA * last)
+        result.append(last)
+    return torch.stack(result[::-1])
+
+
+def policy_loss(imagined: Imagined, rewards: Tensor, critic: nn.Module, inputs: Tensor) -> tuple[Tensor, Tensor]:
+    """The losses of a policy and of its critic. `inputs` [H + 1, B, F] is what the critic sees."""
+    worth = Frozen(critic)(inputs).float().squeeze(-1)
+    gained = returns(rewards, worth)
+    spread = gained.detach().std().clamp(min=0.05)
+    policy = -(gained / spread).mean() - ENTROPY * imagined.entropy.mean()
+    estimate = critic(inputs[:-1].detach()).float().squeeze(-1)
+    return policy, F.mse_loss(estimate, gained.detach())
+
+
+def explorer_loss(learner: Learner, start: State, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
+    """The explorer seeks what the ensemble disagrees about."""
+    imagined = imagine(learner, start, lambda feature: squashed(learner.explorer, feature, generator), generator)
+    inputs = torch.cat([imagined.features[:-1], imagined.actions], dim=-1)
+    guesses = torch.stack([Frozen(member)(inputs).float() for member in learner.ensemble])
+    rewards = guesses.std(0).mean(-1)
+    policy, critic = policy_loss(imagined, rewards, learner.worth_explored, imagined.features)
+    return policy + critic, {"disagreement": rewards.mean()}
+
+
+def achiever_loss(learner: Learner, start: State, goals: Tensor,
+                  generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
+    """The achiever comes near, in temporal distance, to goals [B, 256] that were seen."""
+    policy_of = learner.actor.achiever
+    imagined = imagine(
+        learner, start,
+        lambda feature: squashed(policy_of, torch.cat([feature, goals], dim=-1), generator), generator)
+    wanted = goals.expand(len(imagined.features), -1, -1)
+    encodings = Frozen(learner.encoding)(imagined.features[1:]).float()
+    rewards = -distance_of(Frozen(learner.distance), torch.cat([encodings, wanted[1:]], dim=-1))  # type: ignore[arg-type]  # a network but for its class
+    policy, critic = policy_loss(imagined, rewards, learner.worth_achieved,
+                                 torch.cat([imagined.features, wanted], dim=-1))
+    return policy + critic, {"distance": -rewards.mean()}
