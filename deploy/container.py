@@ -73,7 +73,8 @@ def mine(name: str, worlds: list[Path]) -> list[Path]:
 def takes_part(name: str, world: Path) -> bool:
     """Whether a world needs a service. An agent may do without one of those that others have. Raises SaccadeError if
     the world's configuration cannot be read."""
-    if name not in PARTS_OF_AGENTS or name in load(world / CONFIG_NAME).bus.wait_for:
+    awaited = load(world / CONFIG_NAME).bus.wait_for
+    if name not in PARTS_OF_AGENTS or name in awaited or not awaited:
         return True
     print(f"saccade: {name} has no part in this run", file=sys.stderr, flush=True)
     return False

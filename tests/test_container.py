@@ -8,10 +8,13 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 
 import pytest
 
+from saccade.app.run.launch import resolve
+from saccade.app.run.registry import agent_processes
 from saccade.deploy.container import LATEST, OVER, Container, mine, worlds_of
 from saccade.deploy.director import prepare
 from saccade.shared.config import PACKAGE, Config
@@ -93,6 +96,20 @@ def test_who_is_stopped_before_it_has_begun_is_not_waited_for_long(tmp_path, mon
     container.stop()
     assert container.run() == 0
     assert deaf.returncode == -signal.SIGKILL
+
+
+def test_a_service_that_the_agent_does_without_waits_for_the_end_of_the_run_and_is_well(tmp_path, monkeypatch, capfd):
+    folder, = prepare(resolve(Config().with_values({"scene.objects": "pantry"}), agent_processes("lexa")), 1, tmp_path)
+    monkeypatch.setenv("SACCADE_RUNS", str(tmp_path))
+    monkeypatch.setenv("SACCADE_HEARTBEATS", str(tmp_path / "beats"))
+    container = Container("belief")
+    monkeypatch.setattr(container, "_start", lambda world: pytest.fail("it was started"))
+    watching = threading.Timer(1.0, (folder / OVER).touch)
+    watching.start()
+    assert container.run() == 0
+    watching.join()
+    assert "belief has no part in this run" in capfd.readouterr().err
+    assert list((tmp_path / "beats").iterdir())
 
 
 @pytest.mark.parametrize(("files", "well"), [
