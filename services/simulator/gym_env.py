@@ -100,8 +100,8 @@ class ActiveSearch(gymnasium.Env[Observation, NDArray[np.float64]]):
                 _info(simulator))
 
     def _observe(self, image: NDArray[np.uint8], simulator: Simulator) -> Observation:
-        self._image = image.copy()
-        return {"image": image, "goal": self._goal.copy(), "pose": simulator.state.camera.copy()}
+        self._image = image
+        return {"image": image.copy(), "goal": self._goal.copy(), "pose": simulator.state.camera.copy()}
 
     def render(self) -> NDArray[np.uint8] | None:
         """The camera's image [size_px, size_px, 3] in the render mode `rgb_array`, otherwise None."""
