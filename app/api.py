@@ -10,8 +10,9 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
+from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,10 +27,11 @@ from saccade.app.run.registry import DEFAULT_AGENT, DEFAULT_WORLD, agent_of
 from saccade.app.run.run import run as _run
 from saccade.shared.bus.messages import Result
 from saccade.shared.config import Config, load
-from saccade.shared.errors import SaccadeError
+from saccade.shared.errors import SaccadeError, told
 
-# Several keys end in these words: this is the one that is meant
-NICKNAMES = {"bus": "bus.kind", "source": "camera.source"}
+# Several keys end in these words, or the option of the command line has this name: this is the key that is meant
+NICKNAMES = {"bus": "bus.kind", "source": "camera.source", "scenes": "scene.file", "rate": "camera.rate_hz",
+             "intrinsics": "camera.intrinsics_px"}
 
 
 @dataclass(frozen=True)
@@ -65,8 +67,8 @@ def run(*, goal: str | Path | ArrayLike | None = None, agent: str = DEFAULT_AGEN
     with tempfile.TemporaryDirectory() as folder:
         goal_file = None if goal is None else _file_of(goal, Path(folder))
         keys = keys_of(values) | ({} if goal_file is None else {"scene.goal_image": goal_file})
-        resolved = load(None if config is None else Path(config), agent_of(agent).preset).with_values(keys)
-        finished = _run(resolved, agent=agent, world=world, out=None if out is None else Path(out), plain=True,
+        resolved = load(_path(config, "config"), agent_of(agent).preset).with_values(keys)
+        finished = _run(resolved, agent=agent, world=world, out=_path(out, "out"), plain=True,
                         console=Console(quiet=not show))
     draw_run(finished.folder)
     return Run(finished.folder, finished.config, tuple(finished.results))
@@ -74,8 +76,11 @@ def run(*, goal: str | Path | ArrayLike | None = None, agent: str = DEFAULT_AGEN
 
 def open(path: str | Path) -> Log:
     """Opens the log of a run. `path` is the run's folder or the log file itself. Every format that Saccade ever wrote
-    can be read. The log is read lazily and once, from start to end. Raises SaccadeError if the file is not a log."""
-    return Log(path)
+    can be read. The log is read lazily, from start to end, each time that you iterate it. Raises SaccadeError if the
+    file is not a log."""
+    if path is None:
+        raise SaccadeError("the log is None: give a path as a text or a Path")
+    return Log(_path(path, "the log"))
 
 
 class Agent(_Agent):
@@ -90,7 +95,7 @@ class Agent(_Agent):
     def __init__(self, *, goal: str | Path | ArrayLike | None = None, intrinsics: Sequence[float] | None = None,
                  agent: str = DEFAULT_AGENT, config: str | Path | None = None, **values: Any) -> None:
         preset = agent_of(agent).preset
-        resolved = load(None if config is None else Path(config), preset).with_values(keys_of(values))
+        resolved = load(_path(config, "config"), preset).with_values(keys_of(values))
         super().__init__(resolved, agent=agent, goal=goal, intrinsics=intrinsics)
 
 
@@ -109,7 +114,7 @@ def keys_of(values: dict[str, Any]) -> dict[str, Any]:
         if len(found) != 1:
             raise SaccadeError(f"keyword {name!r} " + (
                 f"could be {' or '.join(found)}: give a section, such as {found[0].split('.')[0]}={{{name!r}: ...}}"
-                if found else "is no key of the configuration"))
+                if found else "is no key of the configuration: the guide's page 'Configuration' lists all keys"))
         keys[found[0]] = list(value) if isinstance(value, tuple) else value
     return keys
 
@@ -126,6 +131,17 @@ def _leaves() -> dict[str, tuple[str, ...]]:
         else:
             leaves[name] = (*leaves.get(name, ()), name)
     return leaves
+
+
+@overload
+def _path(given: None, what: str) -> None: ...
+@overload
+def _path(given: str | Path, what: str) -> Path: ...
+def _path(given: str | Path | None, what: str) -> Path | None:
+    """Returns a path. Raises SaccadeError, which begins with `what`, if it is something else."""
+    if given is not None and not isinstance(given, (str, PathLike)):
+        raise SaccadeError(f"{what} is {told(given)}: give a path as a text or a Path")
+    return None if given is None else Path(given)
 
 
 def _file_of(goal: str | Path | ArrayLike, folder: Path) -> Path:

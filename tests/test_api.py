@@ -12,6 +12,7 @@ from saccade.app.api import keys_of
 from saccade.shared.log.reading import RunReader
 from saccade.shared.log.recording import RunLog
 from saccade.shared.world.geometry import INTRINSICS_PX
+from saccade.shared.world.task import start_pose
 from saccade.tests.fixtures.make import GOLDEN
 
 VALUES = {"objects": "pantry", "names": ("soup_can", "rice_box"), "seed": 4}
@@ -46,6 +47,22 @@ def test_a_log_is_episodes_of_steps(run):
             said = (step.plan, step.action, step.truth, *step.percepts.values(), *step.beliefs.values())
             assert {message.step for message in said} == {step.number}
         assert (steps[-1].frame, steps[-1].truth.done) == (None, True)  # no image follows the last action
+        assert episode.result == run.result
+
+
+def test_a_result_that_is_asked_for_first_passes_over_the_steps(run):
+    log = run.open()
+    for episode in log:
+        assert episode.result == run.result
+        with pytest.raises(saccade.SaccadeError, match=r"steps of episode 0 were passed over, and a log is read once"):
+            list(episode)
+        with pytest.raises(saccade.SaccadeError, match=r"were passed over"):  # also when it is tried again
+            list(episode)
+    for episode in log:  # the file is read again
+        first = next(iter(episode))
+        assert [first.number, *(step.number for step in episode)] == list(range(run.result.steps + 1))
+        with pytest.raises(saccade.SaccadeError, match=r"the steps of episode 0 have been read already"):
+            list(episode)
         assert episode.result == run.result
 
 
@@ -117,6 +134,12 @@ def test_an_agent_takes_images_of_other_cameras(run):
     ({"world_from_camera": np.eye(3)}, "give 4x4"),
     ({"world_from_camera": np.diag([1.0, 1.0, np.nan, 1.0])}, "finite"),
     ({"world_from_camera": np.diag([1.0, 1.0, -1.0, 1.0])}, "no rotation"),
+    ({"world_from_camera": start_pose().T}, "does not end in the row 0 0 0 1: is it transposed?"),
+    ({"world_from_camera": "x"}, "world_from_camera is 'x': give 4x4 finite numbers"),
+    ({"world_from_camera": [[1, 0], [0]]}, "give 4x4 finite numbers"),
+    ({"rgb": [[1, 0], [0]]}, "image is no array of numbers"),
+    ({"intrinsics": (1, 2)}, r"intrinsics \(1, 2\) are not four numbers: give fx, fy, cx, cy"),
+    ({"intrinsics": "abc"}, "intrinsics 'abc' are not four numbers"),
 ])
 def test_what_an_agent_cannot_use_is_told(change, words):
     given = {"rgb": np.zeros((480, 480, 3), np.uint8), "world_from_camera": np.eye(4)} | change
@@ -124,13 +147,39 @@ def test_what_an_agent_cannot_use_is_told(change, words):
         saccade.Agent(**VALUES).step(**given)
 
 
+@pytest.mark.parametrize(("given", "words"), [
+    ((start_pose(), [0, 0], [0, 0, 0]), r"translation_m of shape \[2\]: give 3 finite numbers"),
+    ((np.eye(3), [0, 0, 0], [0, 0, 0]), r"world_from_camera of shape \[3, 3\]"),
+    ((start_pose(), [0, 0, 0], [0, 0, np.nan]), "rotation_rad of shape"),
+    ((start_pose(), "x", [0, 0, 0]), "translation_m is 'x'"),
+])
+def test_an_action_that_is_none_is_told(given, words):
+    with pytest.raises(saccade.SaccadeError, match=words):
+        saccade.apply_action(*given)
+
+
+@pytest.mark.parametrize(("call", "words"), [
+    (lambda: saccade.open(3), "the log is 3: give a path as a text"),
+    (lambda: saccade.open(None), "the log is None: give a path"),
+    (lambda: saccade.run(out=3), "out is 3: give a path"),
+    (lambda: saccade.run(config={"seed": 1}), r"config is \{'seed': 1\}: give a path"),
+    (lambda: saccade.Agent(config=3), "config is 3: give a path"),
+    (lambda: saccade.run(source="images"), "or world='camera' in Python"),
+])
+def test_what_is_no_path_is_told(call, words):
+    with pytest.raises(saccade.SaccadeError, match=words):
+        call()
+
+
 def test_keywords_are_keys_of_the_configuration():
     assert keys_of({"seed": 1, "objects": "ycb", "step_m": 0.1, "bus": "local", "names": ("a",)}) == {
         "seed": 1, "scene.objects": "ycb", "planner.step_m": 0.1, "bus.kind": "local", "scene.names": ["a"]}
     assert keys_of({"planner": {"candidates": 5}, "bus": {"kind": "zenoh"}}) == {
         "planner.candidates": 5, "bus.kind": "zenoh"}
-    with pytest.raises(saccade.SaccadeError, match="'steps' is no key of the configuration"):
+    with pytest.raises(saccade.SaccadeError, match="'steps' is no key of the configuration: the guide's page 'Conf"):
         keys_of({"steps": 1})
+    assert keys_of({"scenes": "a.json", "intrinsics": (1, 2, 3, 4), "rate": 5}) == {  # as the options are called
+        "scene.file": "a.json", "camera.intrinsics_px": [1, 2, 3, 4], "camera.rate_hz": 5}
     assert keys_of({"source": "images", "planner": "my_planner"}) == {
         "camera.source": "images", "services.planner": "my_planner"}
     with pytest.raises(saccade.SaccadeError, match=r"'planner\.step' is unknown"):
@@ -138,9 +187,9 @@ def test_keywords_are_keys_of_the_configuration():
 
 
 def test_a_keyword_that_could_mean_two_keys_is_told(monkeypatch):
-    monkeypatch.setattr("saccade.app.api._leaves", lambda: {"rate": ("camera.rate", "bus.rate")})
-    with pytest.raises(saccade.SaccadeError, match=r"could be camera\.rate or bus\.rate: give a section"):
-        keys_of({"rate": 1})
+    monkeypatch.setattr("saccade.app.api._leaves", lambda: {"pace": ("camera.pace", "bus.pace")})
+    with pytest.raises(saccade.SaccadeError, match=r"could be camera\.pace or bus\.pace: give a section"):
+        keys_of({"pace": 1})
 
 
 def test_the_package_tells_what_it_has():

@@ -47,6 +47,11 @@ def importable(monkeypatch, tmp_path):
     monkeypatch.setenv("PYTHONPATH", f"{PACKAGE / 'examples'}:{tmp_path}")
 
 
+def code_of(page: str, title: str) -> str:
+    """The program with this title on a page of the guide."""
+    return (PACKAGE / "docs" / page).read_text().partition(f'title="{title}"\n')[2].partition("\n```")[0] + "\n"
+
+
 def logged(log) -> dict:
     messages: dict = {}
     for entry in RunReader(log).entries():
@@ -95,9 +100,11 @@ def test_a_source_of_ones_own_stands_in_the_simulators_place(tmp_path):
 
 @pytest.mark.parametrize(("text", "words"), [
     (None, r"module 'mine' cannot be imported \(No module named 'mine'\): install it"),
-    ("import nothing_like_it", r"cannot be imported \(No module named 'nothing_like_it'\)"),
-    ("1 / 0", r"cannot be imported \(division by zero\)"),
-    ("def:", r"cannot be imported \(invalid syntax"),
+    ("import nothing_like_it", r"cannot be imported \(No module named 'nothing_like_it', in \S+/mine.py, line 1\): "
+                               "install nothing_like_it, or repair it"),
+    ("\n1 / 0", r"cannot be imported \(division by zero, in \S+/mine.py, line 2\): repair it"),
+    ("def:", r"cannot be imported \(invalid syntax, in \S+/mine.py, line 1\): repair it"),
+    ("from saccade.shared.bus.topics import NOWHERE", r"'NOWHERE' .*mine.py, line 1\): repair it"),
     ("", "declares no SERVICE"),
     ("SERVICE = 'planner'", "declares no SERVICE"),
     (HEADER + "SERVICE = Service('planner', (BELIEF,), BELIEF, (PLAN, ACTION))", r"has no build\(config\)"),
@@ -118,6 +125,23 @@ def test_a_module_that_is_no_service_gets_one_line(tmp_path, monkeypatch, text, 
         run(Config().with_values({"services.planner": "mine"}), agent="sceneccn", out=tmp_path / "r", plain=True)
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "r").exists()
+
+
+@pytest.mark.parametrize("bus", ["zenoh", "local"])
+@pytest.mark.parametrize(("made", "words"), [
+    ("None", "services.planner: module 'mine': build(config) returns NoneType, which has no method begin and no method "
+             "step: return a core"),
+    ("Wrong()", "planner gives an invalid action: translation_m: not finite; the run cannot go on without it"),
+])
+def test_a_core_that_is_none_or_says_nonsense_gets_one_line(tmp_path, bus, made, words):
+    text = code_of("service.md", "my_package/my_planner.py").replace("np.zeros(3), rot", "np.full(3, np.nan), rot")
+    (tmp_path / "mine.py").write_text(text.replace("MyPlanner(config)", made.replace("Wrong()", "MyPlanner(config)")))
+    done = subprocess.run([sys.executable, "-m", "saccade", "run", "--plain", "--explore", "--names", "soup_can",
+                           "--bus", bus, "--set", "services.planner=mine", "--out", tmp_path / "r"],
+                          capture_output=True, text=True, timeout=120)
+    assert done.returncode == 2, done.stderr
+    assert words in done.stderr
+    assert "Traceback" not in done.stderr
 
 
 def test_without_a_word_all_services_are_ours():

@@ -87,6 +87,9 @@ def test_on_the_bus_as_in_one_process_nothing_is_lost(tmp_path):
     assert done.returncode == 0, done.stdout + done.stderr
     assert "0 differ in a byte" in done.stdout
     assert "loss: 0 of" in done.stdout
+    last = {p: m for t, p, m in RunReader(tmp_path / "replay" / "run.mcap") if t == STATUS}
+    assert {name: status.refused for name, status in last.items()} == dict.fromkeys(
+        ("router", "recorder", *REPLAYABLE), 0)
     topics = [topic for topic in TOPICS.values() if topic != STATUS]
     assert sorted(messages(tmp_path / "replay" / "run.mcap", *topics)) == sorted(messages(recorded, *topics))
 
@@ -112,6 +115,14 @@ def test_a_part_of_a_log(tmp_path):
     assert "percept" not in "".join(line for line in done.stdout.splitlines() if "only" in line and "goal" not in line)
 
 
+def test_nothing_to_compare_is_no_success(tmp_path):
+    done = saccade(GOLDEN, "--into", "planner", "--check", "--bus", "local", "--topics", "goal", "--start", "4",
+                   "--out", tmp_path / "replay")
+    assert done.returncode == 1
+    assert "0 answers compared" in done.stdout
+    assert "nothing could be compared: play more of the log" in done.stdout
+
+
 def test_key_presses_give_one_message_each(tmp_path):
     done = saccade(GOLDEN, "--into", "perception", "--bus", "local", "--step", "--out", tmp_path / "a", keys="  q")
     assert "2 messages played" in done.stdout
@@ -134,6 +145,9 @@ def test_two_logs_at_once_and_more_than_once(tmp_path):
     (["--into", "belief", "--rate", "0"], "--rate 0: give a number from 0.1 to 100, or max"),
     (["--into", "belief", "--start", "x"], "--start and --end: give two steps such as 3, or two times such as 2.5s"),
     (["--into", "belief", "--start", "500s"], "the time asked for is empty"),
+    (["--into", "belief", "--start", "900"], "has the steps 0 to 4: none of from 900 on"),
+    (["--into", "belief", "--start", "7", "--end", "9"], "has the steps 0 to 4: none of 7 to 9"),
+    (["--into", "belief", "--episode", "3"], "has no episode 3: choose from 0 to 0"),
     (["--into", "belief", "--topics", "frames"], "--topics frames: choose from frame"),
     (["--into", "belief", "--perception", "nowhere"], "--perception nowhere: "),
     (["--into", "belief", "--set", "belief.colour=1"], "configuration key 'belief.colour' is unknown"),
@@ -188,6 +202,7 @@ def test_a_mask_may_differ_in_a_few_cells_and_no_more(topic):
 
 def test_a_comparison_waits_for_both_and_tells_what_is_alone():
     comparison, action = Comparison(), sample(ACTION.type, step=1)
+    assert not comparison.equal  # nothing was compared
     later = sample(ACTION.type, step=2)
     comparison.replayed(ACTION, None, encode(action))
     comparison.recorded(ACTION, None, encode(later))

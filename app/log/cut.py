@@ -11,6 +11,9 @@ from saccade.shared.errors import SaccadeError
 from saccade.shared.log.reading import Recorded, RunReader
 from saccade.shared.log.recording import AWAITED, CUT, ENDED_EARLY, FINISHED, LOG, RecordingStopped, RunLog
 
+Times = dict[int, tuple[int, int]]  # by step: first and last time (ns)
+Steps = dict[int, Times]  # by episode
+
 NOT_OF_A_PART = (LOG, ENDED_EARLY, AWAITED, FINISHED)  # metadata about the whole log
 
 
@@ -69,11 +72,30 @@ def cut(log: Path, out: Path, *, episode: int | None = None, start: int = 0, end
     return kept
 
 
+def require_steps(log: Path, episode: int | None, start: int, end: int | None) -> None:
+    """Raises SaccadeError if the log holds none of these steps of an episode, or of any episode."""
+    there = _steps(RunReader(log))
+    for steps in there.values() if episode is None else ():
+        if any(start <= step and (end is None or step <= end) for step in steps):
+            return
+    _chosen(log, there, episode, start, end)
+
+
 def _find(log: Path, episode: int | None, start: int, end: int | None) -> tuple[Range, tuple[int, int]]:
     """Returns which of the given steps the log holds, and the times (ns) between which they were recorded. Raises
     SaccadeError if it holds none."""
-    there: dict[int, dict[int, tuple[int, int]]] = {}  # by episode and step: first and last time
     reader = RunReader(log)
+    there = _steps(reader)
+    episode, chosen = _chosen(log, there, episode, start, end)
+    before = range_of(reader) or Range(episode, 0, 0)
+    last = max(*there[episode], before.end or 0)
+    kept = Range(episode, max(start, before.start), last if end is None else min(end, last))
+    return kept, (min(first for first, _ in chosen.values()), max(last for _, last in chosen.values()))
+
+
+def _steps(reader: RunReader) -> Steps:
+    """The steps of each episode of a log, with the first and the last time at which they were recorded."""
+    there: Steps = {}
     for entry in reader.entries():
         if entry.topic.in_step and not entry.topic.latched:
             try:
@@ -83,19 +105,23 @@ def _find(log: Path, episode: int | None, start: int, end: int | None) -> tuple[
             steps, now = there.setdefault(message.episode, {}), entry.log_time_ns
             first, last = steps.get(message.step, (now, now))
             steps[message.step] = min(first, now), max(last, now)
+    return there
+
+
+def _chosen(log: Path, there: Steps, episode: int | None, start: int, end: int | None) -> tuple[int, Times]:
+    """Returns the episode, by default the last one, and those of its steps that were asked for. Raises SaccadeError if
+    there are none."""
     if not there:
         raise SaccadeError(f"log {log} holds no steps to cut")
     episode = max(there) if episode is None else episode
     if episode not in there:
         raise SaccadeError(f"log {log} has no episode {episode}: choose from {min(there)} to {max(there)}")
-    steps, before = there[episode], range_of(reader) or Range(episode, 0, 0)
+    steps = there[episode]
     chosen = {step: times for step, times in steps.items() if start <= step and (end is None or step <= end)}
     if not chosen:
         asked = f"from {start} on" if end is None else f"{start} to {end}"
         raise SaccadeError(f"episode {episode} of {log} has the steps {min(steps)} to {max(steps)}: none of {asked}")
-    last = max(*steps, before.end or 0)
-    kept = Range(episode, max(start, before.start), last if end is None else min(end, last))
-    return kept, (min(first for first, _ in chosen.values()), max(last for _, last in chosen.values()))
+    return episode, chosen
 
 
 def _kept(entry: Recorded, kept: Range, times: tuple[int, int]) -> int | None:

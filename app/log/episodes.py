@@ -106,16 +106,24 @@ class Episode(_Messages):
     def __init__(self, number: int, steps: Iterator[Step]) -> None:
         super().__init__()
         self.number, self._steps = number, steps
+        self._gone = ""  # why there are no steps to read any more
 
     def __iter__(self) -> Iterator[Step]:
-        """Yields the steps. Raises SaccadeError if the log was read on to the next episode before all steps of this one
-        were read."""
-        return self._steps
+        """Yields the steps. Raises SaccadeError if they have been read already, or were passed over because the result
+        or the next episode was asked for before."""
+        while not self._gone:
+            step = next(self._steps, None)
+            if step is None:
+                self._gone = f"the steps of episode {self.number} have been read already"
+                return
+            yield step
+        raise SaccadeError(f"{self._gone}, and a log is read once: keep the steps in a list before you ask for the "
+                           "result or for the next episode, or open the log again")
 
     def _pass_over(self) -> None:
         left = sum(1 for _ in self._steps)
         if left:
-            self._steps = _passed_over(self.number, left)
+            self._gone = f"{left} steps of episode {self.number} were passed over"
 
     @property
     def goal(self) -> Goal | None:
@@ -129,9 +137,8 @@ class Episode(_Messages):
 
     @property
     def result(self) -> Result | None:
-        """How the episode ended. This reads the steps that were not read yet."""
-        for _ in self._steps:
-            pass
+        """How the episode ended. This passes over the steps that were not read yet, so ask for it after the steps."""
+        self._pass_over()
         return self._get(RESULT)
 
     def __repr__(self) -> str:
@@ -139,8 +146,8 @@ class Episode(_Messages):
 
 
 class Log:
-    """The log of a run. Iterating reads the file once, from its start, and yields its episodes in order. An episode
-    must be read before the next one is asked for."""
+    """The log of a run. Iterating reads the file from its start, and yields its episodes in order. Iterating again
+    reads the file again. An episode must be read before its result or the next episode is asked for."""
 
     def __init__(self, path: str | Path) -> None:
         """`path` is the folder of a run, or its log. Raises SaccadeError if it is not a log."""
@@ -221,8 +228,3 @@ def _steps(entries: _Entries, episode: Episode) -> Iterator[Step]:
     for number in sorted(waiting):
         yield waiting[number]
 
-
-def _passed_over(number: int, left: int) -> Iterator[Step]:
-    raise SaccadeError(f"{left} steps of episode {number} were passed over, since a log is read once: read the steps "
-                       "of an episode before you ask for the next one")
-    yield

@@ -68,9 +68,9 @@ class Comparison:
 
     @property
     def equal(self) -> bool:
-        """Whether nothing differs beyond what is tolerated, and no message is on one side alone."""
-        nothing = self.not_compared and not self.compared
-        return not (self.beyond or self._recorded or self._replayed or nothing)
+        """Whether something was compared, nothing differs beyond what is tolerated, and no message is on one side
+        alone."""
+        return self.compared > 0 and not (self.beyond or self._recorded or self._replayed)
 
     @property
     def only_recorded(self) -> list[At]:

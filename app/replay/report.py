@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.table import Table
 
 from saccade.app.log.check import abbreviated, missing
+from saccade.app.log.cut import require_steps
 from saccade.app.replay.comparison import At
 from saccade.app.replay.displacement import Moved
 from saccade.app.replay.replay import Outcome, Replay, prepare, replay_here, replay_on_bus
@@ -65,10 +66,13 @@ def _range(log: Path, episode: int | None, start: str | None, end: str | None) -
         if ends and all(text.endswith("s") for text in ends):
             times_s = [None if text is None else float(text[:-1]) for text in (start, end)]
             return steps_between(log, FRAME, *times_s, episode=episode)
-        return episode, int(start or 0), None if end is None else int(end)
+        first, last = int(start or 0), None if end is None else int(end)
     except ValueError as error:
         raise SaccadeError(f"--start and --end: give two steps such as 3, or two times such as 2.5s, not "
                            f"{' and '.join(ends)}") from error
+    if ends or episode is not None:
+        require_steps(log, episode, first, last)
+    return episode, first, last
 
 
 def _topic(name: str) -> Topic:
@@ -96,7 +100,7 @@ def replay_all(replays: Sequence[Replay], *, bus: str, out: Path | None, swapped
     Raises SaccadeError if the folder is not new."""
     folder = out or Path("replays") / time.strftime("%Y%m%d-%H%M%S")
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise SaccadeError(f"{folder} is there already: a replay needs a new folder, give another --out")
+        raise SaccadeError(f"{folder} is there already: a replay needs a new folder, name another one")
     return all([_pass(replays, bus, folder / str(i) if loops > 1 else folder, swapped, console)
                 for i in range(loops)])
 
@@ -141,8 +145,10 @@ def tell(replay: Replay, outcome: Outcome, console: Console) -> None:
             note(f"  ... {len(only)} messages are {what}")
     for line in not_compared(comparison.not_compared):
         note(f"  {line}")
-    if comparison.not_compared and not comparison.compared:
-        note("  nothing could be compared: give a log that is whole")
+    if not comparison.compared:
+        remedy = ("give a log that is whole" if comparison.not_compared
+                  else "play more of the log, or more of its topics")
+        note(f"  nothing could be compared: {remedy}")
     if replay.pace.rate is not None and outcome.late_s > 0.1:
         note(f"  the services were too slow for {replay.pace.rate:g} x: up to {outcome.late_s:.1f} s behind")
     _tell_losses(outcome, console)

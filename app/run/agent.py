@@ -20,6 +20,7 @@ from saccade.shared.loop.stepper import Stepper
 from saccade.shared.render.objects import names_in_use
 from saccade.shared.world.geometry import IMAGE_SIZE_PX, INTRINSICS_PX
 from saccade.shared.world.images import read_image
+from saccade.shared.world.task import numbers
 
 Image = NDArray[np.uint8]
 RUN = "agent"
@@ -103,18 +104,20 @@ def image_of(given: str | Path | ArrayLike, what: str) -> Image:
     is no such image."""
     if isinstance(given, (str, Path)):
         return read_image(Path(given), what=what)
-    rgb = np.asarray(given)
+    try:
+        rgb = np.asarray(given)
+    except ValueError as error:  # lists of different lengths
+        raise SaccadeError(f"{what} is no array of numbers: give [height, width, 3] of uint8") from error
     if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8:
         raise SaccadeError(f"{what} of shape {list(rgb.shape)} and type {rgb.dtype}: give [height, width, 3] of uint8")
     return np.ascontiguousarray(rgb)
 
 
 def _pose(given: ArrayLike) -> NDArray[np.float64]:
-    """Checks a pose [4, 4]. Raises SaccadeError if it is not finite, or if its upper left 3x3 numbers are not a
-    rotation."""
-    pose = np.array(given, dtype=np.float64)
-    if pose.shape != (4, 4) or not np.isfinite(pose).all():
-        raise SaccadeError(f"world_from_camera of shape {list(pose.shape)}: give 4x4 finite numbers")
+    """Checks a pose [4, 4]. Raises SaccadeError if it is not finite, or not a rigid transform."""
+    pose = numbers(given, (4, 4), "world_from_camera", "4x4 finite numbers")
+    if np.abs(pose[3] - (0, 0, 0, 1)).max() > ORTHONORMAL:
+        raise SaccadeError("world_from_camera does not end in the row 0 0 0 1: is it transposed?")
     rotation = pose[:3, :3]
     if np.abs(rotation.T @ rotation - np.eye(3)).max() > ORTHONORMAL or np.linalg.det(rotation) < 0:
         raise SaccadeError("world_from_camera: its upper left 3x3 numbers are no rotation")

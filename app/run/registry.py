@@ -109,7 +109,7 @@ def agent_processes(agent: str, world: str = DEFAULT_WORLD, *, view: bool = Fals
     Raises SaccadeError if the agent runs only within one process."""
     chosen, place = agent_of(agent), world_of(world)
     if chosen.cores:
-        raise SaccadeError(f"agent {agent!r} runs within one process only: add `--bus local`")
+        raise SaccadeError(f"agent {agent!r} runs within one process only: add `--bus local`, or bus='local' in Python")
     names = (ROUTER, place.source, *chosen.services, *place.judges, RECORDER)
     return (*(Process(name, f"saccade.services.{name}") for name in names), *((VIEWER,) if view else ()))
 

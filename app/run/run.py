@@ -108,7 +108,7 @@ def in_world(config: Config, world: str) -> Config:
     scene, camera = config.scene, config.camera
     if not world_of(world).live:
         if camera.source is not None:
-            raise SaccadeError("camera.source is for a real camera: add `--world camera`")
+            raise SaccadeError("camera.source is for a real camera: add `--world camera`, or world='camera' in Python")
         return config
     if scene.file or scene.scene or scene.n_objects or scene.count > 1:
         raise SaccadeError(f"scenes are the simulator's: with `--world {world}` leave --scenes, --scene, --n-objects "
@@ -218,7 +218,7 @@ def _interrupted_between_messages() -> Iterator[Callable[[], None]]:
 
 def _new_folder(folder: Path) -> Path:
     if not is_text(str(folder.absolute())):
-        raise SaccadeError(f"run folder {folder} must be Unicode without control codes: give another --out")
+        raise SaccadeError(f"run folder {folder} must be Unicode without control codes: name another folder")
     if os.path.lexists(folder) and (not os.path.isdir(folder) or any(folder.iterdir())):
-        raise SaccadeError(f"{folder} is there already: a run needs a new folder, give another --out")
+        raise SaccadeError(f"{folder} is there already: a run needs a new folder, name another one")
     return folder

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 
 from saccade.shared.bus.messages import Message
 from saccade.shared.bus.topics import Output, Topic
-from saccade.shared.bus.wire import encode
+from saccade.shared.bus.wire import MessageError, encode
 from saccade.shared.errors import SaccadeError
 from saccade.shared.loop.main import WAITS
 from saccade.shared.loop.service import Core, Service
@@ -19,7 +19,8 @@ OnStep = Callable[[str, float], None]
 
 
 class Pump:
-    """Brings messages from core to core within this process, in the order of publication.
+    """Brings messages from core to core within this process, in the order of publication. Raises SaccadeError, which
+    names the sender, if a message is not valid.
 
     `on_message(topic, part, message, payload)` sees every message. With `encoded`, `payload` holds the encoded bytes;
     otherwise it is None, and messages are passed on as they are. `on_step(service, milliseconds)` is told how long each
@@ -35,15 +36,25 @@ class Pump:
         waiting = deque(outputs)
         while waiting:
             output = waiting.popleft()
-            message = settle(output.message)
-            if self._on_message is not None:
-                self._on_message(output.topic, output.part, message, encode(message) if self._encoded else None)
-            for stepper in self._steppers:
-                if output.topic not in stepper.service.inputs:
-                    continue
+            try:
+                waiting.extend(self._pass_on(output))
+            except MessageError as error:
+                makers = [s.service.name for s in self._steppers if output.topic in s.service.outputs]
+                raise SaccadeError(f"{makers[0] if makers else 'the source'} gives an invalid {output.topic.name}: "
+                                   f"{error}; the run cannot go on without it") from error
+
+    def _pass_on(self, output: Output) -> list[Output]:
+        """Gives a message to those who take it, and returns what they say to it."""
+        message = settle(output.message)
+        if self._on_message is not None:
+            self._on_message(output.topic, output.part, message, encode(message) if self._encoded else None)
+        answers: list[Output] = []
+        for stepper in self._steppers:
+            if output.topic in stepper.service.inputs:
                 stepper.offer(output.topic, output.part, message)
                 while (made := _advance(stepper, self._on_step)) is not None:
-                    waiting.extend(made)
+                    answers.extend(made)
+        return answers
 
 
 def run_local(pairs: Sequence[tuple[Service, Core]], parts: tuple[str, ...], run_id: str,

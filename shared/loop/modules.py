@@ -4,7 +4,9 @@ place."""
 from __future__ import annotations
 
 import re
+import traceback
 from collections.abc import Callable
+from functools import partial
 from importlib import import_module
 from typing import NamedTuple
 
@@ -14,7 +16,7 @@ from saccade.shared.errors import SaccadeError
 from saccade.shared.loop.service import Core, Service
 
 SOURCES = ("simulator", "camera")  # a run has one of them, and `services.source` replaces it
-EXAMPLE = "see examples/greedy_planner"
+EXAMPLE = "the guide's page 'Your own service' shows how"
 
 
 class ServiceModule(NamedTuple):
@@ -49,8 +51,7 @@ def load(name: str, config: Config, *, compare: bool = True) -> ServiceModule:
     try:
         module = import_module(chosen)
     except Exception as error:  # a module from outside may raise anything when it is imported
-        why = re.sub(r"\s+", " ", str(error)) or type(error).__name__
-        raise SaccadeError(f"{told} cannot be imported ({why}): install it, or put its folder on PYTHONPATH") from error
+        raise SaccadeError(f"{told} cannot be imported {_why(error, chosen)}") from error
     service, build = getattr(module, "SERVICE", None), getattr(module, "build", None)
     if not isinstance(service, Service):
         raise SaccadeError(f"{told} declares no SERVICE (a saccade.shared.loop.service.Service): {EXAMPLE}")
@@ -58,7 +59,33 @@ def load(name: str, config: Config, *, compare: bool = True) -> ServiceModule:
         raise SaccadeError(f"{told} has no build(config) that makes its core: {EXAMPLE}")
     if compare:
         _require_alike(told, service, import_module(ours).SERVICE)
-    return ServiceModule(service, build)
+    return ServiceModule(service, partial(_built, told, build))
+
+
+def _why(error: Exception, chosen: str) -> str:
+    """Returns why a module cannot be imported, where, and what to do."""
+    said = error.msg if isinstance(error, SyntaxError) else str(error)
+    why = re.sub(r"\s+", " ", said) or type(error).__name__
+    missing = error.name if isinstance(error, ModuleNotFoundError) else None
+    if missing and f"{chosen}.".startswith(f"{missing}."):
+        return f"({why}): install it, or put its folder on PYTHONPATH"
+    file, line = "its file", None
+    if isinstance(error, SyntaxError):
+        file, line = error.filename or file, error.lineno
+    for frame in traceback.extract_tb(error.__traceback__) if line is None else ():
+        if not frame.filename.startswith("<"):  # Python's own importer
+            file, line = frame.filename, frame.lineno
+    return f"({why}, in {file}, line {line}): " + (f"install {missing}, or repair it" if missing else "repair it")
+
+
+def _built(told: str, build: Callable[[Config], Core], config: Config) -> Core:
+    """Builds the core of a module from outside. Raises SaccadeError if it is none."""
+    core = build(config)
+    lacks = [name for name in ("begin", "step") if not callable(getattr(core, name, None))]
+    if lacks:
+        raise SaccadeError(f"{told}: build(config) returns {type(core).__name__}, which has no method "
+                           f"{' and no method '.join(lacks)}: return a core; {EXAMPLE}")
+    return core
 
 
 def _require_alike(told: str, service: Service, ours: Service) -> None:

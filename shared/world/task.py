@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from saccade.shared.errors import SaccadeError, told
 from saccade.shared.world.geometry import Array, direction, look_at, rotation_angle, rotation_xyz, spherical, wrap
 
 MAX_STEPS = 350
@@ -69,18 +70,33 @@ def clip(position: ArrayLike, spheres: Spheres) -> Array:
     return np.clip(result, LOWER_M, UPPER_M)
 
 
+def numbers(given: ArrayLike, shape: tuple[int, ...], what: str, need: str) -> Array:
+    """Returns a copy of what was given as an array of this shape. Raises SaccadeError, which begins with `what` and
+    ends with what is needed, if it is something else or not finite."""
+    try:
+        array = np.array(given, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise SaccadeError(f"{what} is {told(given)}: give {need}") from error
+    if array.shape != shape or not np.isfinite(array).all():
+        raise SaccadeError(f"{what} of shape {list(array.shape)}: give {need}")
+    return array
+
+
 def apply_action(world_from_camera: ArrayLike, translation_m: ArrayLike, rotation_rad: ArrayLike) -> Array:
     """Returns the camera pose [4, 4] after an action, before `clip`. The camera is moved by `translation_m` [3] and
     turned by the angles `rotation_rad` [3], both along the axes of the world.
 
-    Components that exceed the limit of 0.5 are reduced to it. The rotation is made orthonormal again.
+    Components that exceed the limit of 0.5 are reduced to it. The rotation is made orthonormal again. Raises
+    SaccadeError if one of the three has another shape, or numbers that are not finite.
     """
-    before = np.asarray(world_from_camera, dtype=np.float64)
-    turn = rotation_xyz(np.clip(rotation_rad, -ACTION_LIMIT, ACTION_LIMIT))
+    before = numbers(world_from_camera, (4, 4), "world_from_camera", "4x4 finite numbers")
+    shift = numbers(translation_m, (3,), "translation_m", "3 finite numbers")
+    turn = rotation_xyz(np.clip(numbers(rotation_rad, (3,), "rotation_rad", "3 finite numbers"),
+                                -ACTION_LIMIT, ACTION_LIMIT))
     u, _, vt = np.linalg.svd(turn @ before[:3, :3])
     after = np.eye(4)
     after[:3, :3] = u @ vt
-    after[:3, 3] = before[:3, 3] + np.clip(translation_m, -ACTION_LIMIT, ACTION_LIMIT)
+    after[:3, 3] = before[:3, 3] + np.clip(shift, -ACTION_LIMIT, ACTION_LIMIT)
     return after
 
 
