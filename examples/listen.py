@@ -1,4 +1,4 @@
-"""Reads frames and beliefs off the bus of a run, without Saccade: any language with Zenoh and MessagePack can do it.
+"""Reads frames and beliefs off the bus of a run, without Saccade. Any language with Zenoh and MessagePack can do this.
 
     pip install eclipse-zenoh msgpack numpy
     python examples/listen.py tcp/127.0.0.1:PORT [COUNT]
@@ -6,10 +6,10 @@
 The address is `bus.endpoint` in the run's config.json. docs/wire.md describes every key and field.
 """
 
+import argparse
 import json
 import math
 import queue
-import sys
 
 import msgpack
 import numpy as np
@@ -45,4 +45,9 @@ def main(endpoint: str, count: int) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], int(sys.argv[2]) if len(sys.argv) > 2 else 100)
+    parser = argparse.ArgumentParser(description="Prints frames and beliefs from the bus of a run.")
+    parser.add_argument("endpoint", help="address of the bus, such as tcp/127.0.0.1:41305: bus.endpoint in the run's "
+                                         "config.json")
+    parser.add_argument("count", nargs="?", type=int, default=100, help="end after so many messages (default: 100)")
+    given = parser.parse_args()
+    main(given.endpoint, given.count)

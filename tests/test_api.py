@@ -67,7 +67,7 @@ def test_a_result_that_is_asked_for_first_passes_over_the_steps(run):
 
 
 def test_logs_of_every_format_read(tmp_path):
-    for path in (GOLDEN, GOLDEN.with_name("format_1.mcap"), GOLDEN.with_name("format_2.mcap")):
+    for path in (GOLDEN, *(GOLDEN.with_name(f"format_{number}.mcap") for number in (1, 2, 3))):
         for episode in saccade.open(path):
             steps = list(episode)
             assert steps[0].frame is not None, path

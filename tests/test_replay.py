@@ -20,12 +20,13 @@ from saccade.app.run.run import run
 from saccade.shared.bus.messages import field_types
 from saccade.shared.bus.topics import ACTION, BELIEF, FRAME, GOAL_PERCEPT, PERCEPT, STATUS, TOPICS
 from saccade.shared.bus.wire import encode
+from saccade.shared.log.migrations import FORMAT, OLDEST
 from saccade.shared.log.reading import RunReader
 from saccade.shared.log.recording import RunLog
 from saccade.tests.fixtures.make import CONFIG, GOLDEN, IN_WORDS, WORDS, changes, in_words
 from saccade.tests.samples import sample
 
-FORMAT_1, FORMAT_2 = GOLDEN.with_name("format_1.mcap"), GOLDEN.with_name("format_2.mcap")
+FORMAT_1, FORMAT_2, FORMAT_3 = (GOLDEN.with_name(f"format_{number}.mcap") for number in (1, 2, 3))
 WAIT_S = 300
 
 
@@ -68,12 +69,17 @@ def test_the_oldest_format_still_replays_to_the_byte(tmp_path):
     assert again == {(name, p) for name, p, _ in messages(FORMAT_1, *IN_WORDS)}
 
 
-def test_what_a_format_did_not_have_is_no_difference(tmp_path):
-    """Format 2 had neither masks nor candidates; all else is compared."""
-    reader = RunReader(FORMAT_2)
-    assert {m.mask_bits is None for t, _, m in reader if t == PERCEPT} == {True}
-    assert reader.format == 2
-    done = saccade(FORMAT_2, "--into", "perception,belief,planner", "--check", "--bus", "local", "--out",
+def test_the_golden_log_has_the_present_format_and_each_older_one_has_a_log():
+    readers = [RunReader(log) for log in (FORMAT_1, FORMAT_2, FORMAT_3, GOLDEN)]
+    assert all(list(reader) for reader in readers)
+    assert [reader.format for reader in readers] == list(range(OLDEST, FORMAT + 1))
+
+
+@pytest.mark.parametrize(("log", "lacks"), [(FORMAT_2, "mask_bits"), (FORMAT_3, "camera_from_object")])
+def test_what_a_format_did_not_have_is_no_difference(tmp_path, log, lacks):
+    """Format 2 had neither masks nor candidates, and format 3 no poses; all else is compared."""
+    assert {getattr(m, lacks) is None for t, _, m in RunReader(log) if t == PERCEPT} == {True}
+    done = saccade(log, "--into", "perception,belief,planner", "--check", "--bus", "local", "--out",
                    tmp_path / "replay")
     assert done.returncode == 0, done.stdout + done.stderr
     assert "0 beyond what is tolerated" in done.stdout

@@ -95,7 +95,7 @@ def _decompressed(chunk: mcap.Chunk, size: int) -> bytes:
             raise ValueError("a chunk has another size than it says")
         return zstandard.decompress(chunk.data, size) if size else b""
     if chunk.compression == "lz4":
-        from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
+        from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]  # it says nothing of its types
 
         return LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
     if chunk.compression:
