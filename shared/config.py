@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError,
 
 from saccade.shared.errors import SaccadeError, is_text, told
 from saccade.shared.files import MIB, parse_json, parse_toml, read_text, replace_whole, size_of, writing
+from saccade.shared.wording import MODULE, TOKEN, WORLD, plain_of
 
 PACKAGE = Path(__file__).resolve().parent.parent  # the folder of `saccade`: in a checkout the repository
 PRESETS, WEIGHTS = PACKAGE / "shared" / "presets", PACKAGE / "weights"
@@ -20,6 +21,7 @@ PRESETS, WEIGHTS = PACKAGE / "shared" / "presets", PACKAGE / "weights"
 MAX_FILE_BYTES = 1 * MIB
 MAX_TEXT = 1024  # characters of a value; paths are the longest
 MANY = 1_000_000  # limit for steps, scenes and the like; more would never end
+_KEYS = "the guide's page 'Configuration' lists all keys"
 _NEED = "give a file of TOML or JSON, or leave it out for the default"
 
 
@@ -37,7 +39,7 @@ class Section(BaseModel):
 
 
 Checked = TypeVar("Checked", bound=Section)
-ModuleName = Annotated[str, Field(pattern=r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*$")]
+ModuleName = Annotated[str, Field(pattern=MODULE)]
 Focal = Annotated[FiniteFloat, Field(gt=0)]
 
 
@@ -50,7 +52,7 @@ class BusConfig(Section):
     """Address of the router. With port 0, the launcher picks a free port."""
     listen: str | None = None
     """Address on which the router listens, if the other services know it by another one."""
-    world: str = Field("table", pattern=r"^[A-Za-z0-9_-]{1,64}$")
+    world: str = Field("table", pattern=WORLD)
     """Second part of every key. A world is one camera in one scene; several worlds can share a bus."""
     wait_for: tuple[str, ...] = ()
     """Services that must be ready before the source begins. The launcher fills this in."""
@@ -97,7 +99,11 @@ class SimulatorConfig(Section):
     """`reached`: an episode ends at the first step within the tolerance, as in the paper. `declared`: it ends when the
     agent says that it has arrived."""
     publish_depth: bool = False
-    """Whether frames carry depth. No agent that comes with Saccade needs it."""
+    """Whether frames carry depth. PoseCNN uses it."""
+    look: str = "flat"
+    """Light, surfaces and the camera's faults: the name of a look that comes with Saccade, or a TOML file."""
+    goal_look: str | None = None
+    """The look of the goal image, if it is another one."""
 
 
 class CameraConfig(Section):
@@ -201,7 +207,7 @@ class ViewerConfig(Section):
     """Address on which the viewer listens. If other hosts can reach it, a browser needs the token."""
     published: str | None = None
     """Address on which a container's ports are published. With a loopback address a browser needs no token."""
-    token: str | None = Field(None, pattern=r"^[A-Za-z0-9_-]{16,128}$")
+    token: str | None = Field(None, pattern=TOKEN)
     """Token that a browser must give. The launcher draws a new one for every run and prints it in the address."""
     port: int = Field(9090, ge=1, le=65535)
     """Port of the page."""
@@ -253,8 +259,7 @@ class Config(Section):
             for parent in parents:
                 node = node.get(parent) if isinstance(node, dict) else None
             if not isinstance(node, dict) or last not in node:
-                raise SaccadeError(f"configuration key {told(dotted)} is unknown: the guide "
-                                   "(docs/reference/configuration.md) lists all keys")
+                raise SaccadeError(f"configuration key {told(dotted)} is unknown: {_KEYS}")
             node[last] = str(value) if isinstance(value, Path) else value
         return validate(tree, "the given values")
 
@@ -270,14 +275,15 @@ def validate(tree: dict[str, Any], where: str) -> Config:
     return checked(Config, tree, f"configuration key {{}} in {where}")
 
 
-def checked(model: type[Checked], tree: dict[str, Any], what: str) -> Checked:
+def checked(model: type[Checked], tree: dict[str, Any], what: str, context: dict[str, Any] | None = None) -> Checked:
     """Returns the section in a tree. Raises SaccadeError, which begins with `what`; the wrong key replaces its {}."""
     try:
-        return model.model_validate(tree)
+        return model.model_validate(tree, context=context)
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
-        raise SaccadeError(f"{what.replace('{}', told(key))}: {first['msg'].removeprefix('Value error, ')}") from error
+        keys = f"; {_KEYS}" if model is Config and first["type"] == "extra_forbidden" else ""
+        raise SaccadeError(f"{what.replace('{}', told(key))}: {plain_of(first)}{keys}") from error
 
 
 def recorded(text: str | None, where: str) -> Config:

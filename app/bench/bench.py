@@ -21,7 +21,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from saccade.app.bench import table
-from saccade.app.bench.suites import default_suite, suite_file
+from saccade.app.bench.suites import SUITES, default_suite, suite_file
 from saccade.app.bench.workers import in_processes
 from saccade.app.provenance import machine, shown
 from saccade.app.run.display import say
@@ -86,6 +86,7 @@ def prepare(agent: str, config: Config, out: Path, *, suite: str | None = None, 
     if path is None:
         suite = suite or default_suite(config.scene.objects)
         path = suite_file(suite, config, out.with_name(out.stem + SCENES_ENDING))
+        config = config.with_values(dict(SUITES[suite].values))
     config = config.with_values({"scene.names": list(names), "scene.file": str(path.resolve()), "bus.kind": "local"})
     weight_hashes(agent, config)
     scenes = tuple(load_scenes(path, names))

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -21,18 +21,22 @@ from saccade.shared.render.objects import load_mesh, names_in_use
 
 Yaw = Literal["random", "fixed"]
 
-YAW_SEED = 31_415_000
+YAW_SEED, LOOKS_SEED = 31_415_000, 16_180_000
+LOOKS_REPEATS = 4
+IN_ANY_LIGHT = {"simulator.look": "random", "simulator.goal_look": "random"}
 DEV_SEEDS: dict[Yaw, int] = {"fixed": 57_721_000, "random": 57_722_000}  # of the halves without and with turned objects
 DEV_REPEATS = 2  # repeats in each half
 
 
 @dataclass(frozen=True)
 class Suite:
-    """Scenes that `draw(sizes, seed of the run)` makes, or the scenes of a file, which belong to one object set."""
+    """Scenes that `draw(sizes, seed of the run)` makes, or the scenes of a file, which belong to one object set.
+    `values` are keys of the configuration that belong to the suite, too."""
 
     draw: Callable[[Sizes, int], list[Scene]] | None = None
     file: Path | None = None
     objects: str | None = None
+    values: Mapping[str, str] = field(default_factory=dict)
 
 
 def _split(sizes: Sizes, seed: int, yaw: Yaw, repeats: int = 20) -> list[Scene]:
@@ -48,6 +52,7 @@ SUITES = {
     "paper-500": Suite(file=PAPER_SCENES, objects="ycb"),
     "yaw-500": Suite(lambda sizes, _seed: _split(sizes, YAW_SEED, "random")),
     "lexa-room": Suite(lambda sizes, _seed: room_scenes(sizes)),
+    "looks": Suite(lambda sizes, _seed: _split(sizes, LOOKS_SEED, "random", LOOKS_REPEATS), values=IN_ANY_LIGHT),
     "dev": Suite(_dev),
     "paper-like": Suite(lambda sizes, seed: _split(sizes, seed, "fixed")),
     "paper-like-yaw": Suite(lambda sizes, seed: _split(sizes, seed, "random")),

@@ -29,7 +29,7 @@ Cluster = Annotated[str | None, typer.Option(
 @app.command()
 def bench(*, objects: Objects = None, scenes: ScenesFile = None,
           suite: Annotated[str | None, typer.Option(
-              help="Scenes: paper-500, yaw-500, lexa-room, dev (for tuning) or paper-like.",
+              help="Scenes: paper-500, yaw-500, lexa-room, looks, dev (for tuning), paper-like or paper-like-yaw.",
               show_default="paper-500 for ycb, paper-like for pantry")] = None,
           agent: Annotated[str, typer.Option(help=f"Which agent to measure: {AGENTS}.")] = "sceneccn",
           limit: Annotated[int | None, typer.Option(min=1, help="Run only so many scenes, chosen evenly.")] = None,

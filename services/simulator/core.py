@@ -15,6 +15,7 @@ from saccade.shared.config import Config
 from saccade.shared.errors import SaccadeError
 from saccade.shared.loop.seeding import generator
 from saccade.shared.loop.service import Inputs, Service
+from saccade.shared.render.look import RANDOM, Look, load_look, random_look
 from saccade.shared.render.objects import load_mesh, names_in_use
 from saccade.shared.render.world import World
 from saccade.shared.world.images import read_goal_image
@@ -31,6 +32,26 @@ class At(TypedDict):
     step: int
 
 
+class Looks:
+    """How each episode of a run looks. Raises SaccadeError if a look is missing or wrong."""
+
+    def __init__(self, config: Config):
+        self.config, told = config, config.simulator
+        self._scenes = None if told.look == RANDOM else load_look(told.look)
+        name = told.goal_look or told.look
+        self._goals = None if name == RANDOM else load_look(name)
+        self._alike = told.goal_look is None  # then the goal has the look of its scene, also where it is drawn
+
+    def of(self, episode: int) -> tuple[Look, Look]:
+        """The looks of an episode's scene and of its goal image."""
+        scene = self._scenes or random_look(self.generator(episode, 0, "look"))
+        return scene, scene if self._alike else self._goals or random_look(self.generator(episode, 0, "goal look"))
+
+    def generator(self, episode: int, step: int, what: str) -> np.random.Generator:
+        """The generator of the randomness of a look at one step."""
+        return generator(self.config.seed, self.config.bus.world, episode, step, f"look {what}")
+
+
 class Simulator:
     """A world that runs one episode after the other. Episode k has scene k.
 
@@ -41,10 +62,11 @@ class Simulator:
 
     def __init__(self, world: World, scenes: Sequence[Scene], *, max_steps: int = MAX_STEPS,
                  publish_depth: bool = False, goal_rgb: NDArray[np.uint8] | None = None, explore: bool = False,
-                 until: Literal["reached", "declared"] = "reached"):
+                 until: Literal["reached", "declared"] = "reached", looks: Looks | None = None):
         self.world, self.scenes, self.max_steps = world, tuple(scenes), max_steps
         self.publish_depth, self.goal_rgb, self.explore = publish_depth, goal_rgb, explore
         self.until = "declared" if goal_rgb is not None else until
+        self.looks = looks or Looks(Config())
         # Camera pose, image and depth of the last frame. Where the camera stands still, nothing is rendered again.
         self._shown: tuple[NDArray[np.float64], NDArray[np.uint8], NDArray[np.float32] | None] | None = None
 
@@ -62,13 +84,14 @@ class Simulator:
             raise SaccadeError(f"episode {episode} does not exist: there are {self.episodes}, counted from 0")
         self.scene = self.scenes[episode]
         self._run, self._episode = run, episode
+        self.look, goal_look = self.looks.of(episode)
         present = self.scene.on_table
         spheres = spheres_around([p.center_m for p in present], [self.world.meshes[p.name].size_m for p in present])
         judged = self.goal_rgb is None and not self.explore
         self.state = Episode(self.scene.goal_world_from_camera, spheres, max_steps=self.max_steps, judged=judged,
                              until=self.until)
-        goal = Goal(**self._stamp(), rgb=self._goal_image(), intrinsics_px=self.world.intrinsics_px)
-        self._place(present)
+        goal = Goal(**self._stamp(), rgb=self._goal_image(goal_look), intrinsics_px=self.world.intrinsics_px)
+        self._place(present, self.look)
         return [Output(GOAL, goal), *self._outputs()]
 
     def step(self, inputs: Inputs) -> list[Output]:
@@ -85,12 +108,14 @@ class Simulator:
     def _stamp(self) -> At:
         return {"run": self._run, "episode": self._episode, "step": self.state.step}
 
-    def _place(self, objects: Sequence[Placed]) -> None:
+    def _place(self, objects: Sequence[Placed], look: Look) -> None:
+        if self.world.look is not look:
+            self.world.set_look(look)
         self.world.place({p.name: (p.center_m, p.yaw_rad) for p in objects}, self.scene.table_rgb)
         self._shown = None
 
-    def _goal_image(self) -> NDArray[np.uint8] | None:
-        """The goal image [H, W, 3]: the user's, or the target alone on the table, rendered from the goal's pose.
+    def _goal_image(self, look: Look) -> NDArray[np.uint8] | None:
+        """The goal image [H, W, 3]: the user's, or the target alone on the table, seen from the goal's pose.
 
         None if the agent explores.
         """
@@ -98,8 +123,9 @@ class Simulator:
             return None
         if self.goal_rgb is not None:
             return self.goal_rgb
-        self._place([self.scene.target_placed])
-        return self.world.render(self.scene.goal_world_from_camera)
+        self._place([self.scene.target_placed], look)
+        image = self.world.render(self.scene.goal_world_from_camera)
+        return look.seen(image, self.looks.generator(self._episode, 0, "goal"))
 
     def _outputs(self) -> list[Output]:
         truth = Output(TRUTH, self._truth())
@@ -110,7 +136,8 @@ class Simulator:
         if self._shown is None or not np.array_equal(self._shown[0], camera):
             depth = self.world.render_depth(camera) if self.publish_depth else None
             self._shown = camera, self.world.render(camera), depth
-        _, rgb, depth = self._shown
+        _, rendered, depth = self._shown
+        rgb = self.look.seen(rendered, self.looks.generator(self._episode, self.state.step, "camera"))
         return Frame(**self._stamp(), rgb=rgb, intrinsics_px=self.world.intrinsics_px, world_from_camera=camera,
                      depth_m=depth)
 
@@ -156,9 +183,10 @@ def build(config: Config) -> Simulator:
 
     Raises SaccadeError if an object, the scenes or the goal image are missing or damaged, or without OpenGL.
     """
-    scene = config.scene
+    scene, looks = config.scene, Looks(config)
     goal_rgb = read_goal_image(scene.goal_image) if scene.goal_image is not None else None
     meshes = tuple(load_mesh(scene.objects, name) for name in names_in_use(scene))
     scenes = scenes_of(config, {mesh.name: mesh.size_m for mesh in meshes})
     return Simulator(World(meshes), scenes, max_steps=config.simulator.max_steps, until=config.simulator.until,
-                     publish_depth=config.simulator.publish_depth, goal_rgb=goal_rgb, explore=scene.explore)
+                     publish_depth=config.simulator.publish_depth, goal_rgb=goal_rgb, explore=scene.explore,
+                     looks=looks)

@@ -6,11 +6,14 @@ import weakref
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from PIL import Image
 
 from saccade.shared.errors import SaccadeError
+from saccade.shared.render.look import FLAT, MOST_LIGHTS, Look
 from saccade.shared.render.mesh import Mesh
 from saccade.shared.render.opengl import HOW_TO_MEND, choose_backend
-from saccade.shared.world.geometry import IMAGE_SIZE_PX, INTRINSICS_PX
+from saccade.shared.render.surfaces import SIDE_PX
+from saccade.shared.world.geometry import IMAGE_SIZE_PX, INTRINSICS_PX, unit
 
 choose_backend()
 try:
@@ -19,6 +22,9 @@ except (ImportError, AttributeError, OSError) as error:  # PyOpenGL raises Attri
     raise SaccadeError(f"{HOW_TO_MEND} ({error})") from error
 
 TABLE_SIDE_M = 1.0
+TABLE, PLAIN, SKY = "table", "plain", "sky"  # names in the model
+SKY_PX = 256  # side of each of the background's six faces
+LIGHT_M = 2.0  # how far from the centre of the table a light is put; it shines as from far away
 NEAR_M, FAR_M = 0.05, 3.0
 _OUT_OF_SIGHT = np.array([0.0, 0.0, -100.0])
 
@@ -36,6 +42,7 @@ def _build(meshes: tuple[Mesh, ...]) -> mujoco.MjModel:
                             contype=0, conaffinity=0)
     rig = spec.worldbody.add_body(name="camera", mocap=True)
     rig.add_camera(name="camera", resolution=[IMAGE_SIZE_PX] * 2, sensor_size=[1, 1], focal_pixel=[IMAGE_SIZE_PX] * 2)
+    _add_surroundings(spec)
     for mesh in meshes:
         _add_object(spec, mesh)
     model = spec.compile()
@@ -43,6 +50,19 @@ def _build(meshes: tuple[Mesh, ...]) -> mujoco.MjModel:
         start = model.tex_adr[model.tex(mesh.name).id]
         model.tex_data[start:start + mesh.texture.size] = np.flipud(mesh.texture).ravel()
     return model
+
+
+def _add_surroundings(spec: mujoco.MjSpec) -> None:
+    """What looks need and the flat look does not show: lights, a texture for the table, and one for the background."""
+    for number in range(MOST_LIGHTS):
+        spec.worldbody.add_light(name=f"light {number}", type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, active=False)
+    for name, kind, height in ((TABLE, mujoco.mjtTexture.mjTEXTURE_2D, SIDE_PX),
+                               (SKY, mujoco.mjtTexture.mjTEXTURE_SKYBOX, 6 * SKY_PX)):
+        spec.add_texture(name=name, type=kind, width=height if name == TABLE else SKY_PX, height=height, nchannel=3,
+                         builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT)
+    spec.add_material(name=PLAIN, specular=0.0)
+    textured = spec.add_material(name=TABLE, specular=0.0, texuniform=True)
+    textured.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = TABLE
 
 
 def _add_object(spec: mujoco.MjSpec, mesh: Mesh) -> None:
@@ -79,6 +99,7 @@ class World:
             raise SaccadeError(f"{HOW_TO_MEND} ({error})") from error
         weakref.finalize(self, self.renderer.close)  # closes it before the interpreter unloads OpenGL
         self.set_intrinsics(intrinsics_px)
+        self.set_look(FLAT)
         self.place({})
 
     def set_intrinsics(self, intrinsics_px: ArrayLike) -> None:
@@ -95,11 +116,49 @@ class World:
         `table_rgb` is from 0 to 255.
         """
         self.poses = dict(poses)
-        self.model.geom("table").rgba[:3] = np.asarray(table_rgb) / 255.0
+        textured = self.look.table_texture is not None
+        self.model.geom("table").rgba[:3] = 1.0 if textured else np.asarray(table_rgb) / 255.0
         for name, mocap in self._mocap.items():
             center, yaw = poses.get(name, (_OUT_OF_SIGHT, 0.0))
             self.data.mocap_pos[mocap] = center
             self.data.mocap_quat[mocap] = (np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2))
+
+    def set_look(self, look: Look) -> None:
+        """Sets lights, the table's surface and the background. It must be set before the objects are placed.
+
+        What the camera does to the image (`Look.seen`) is not a part of the rendering.
+        """
+        self.look, model = look, self.model
+        model.vis.headlight.ambient[:], model.vis.headlight.diffuse[:] = look.ambient, look.headlight
+        model.mat_specular[:] = look.object_specular
+        for name in (PLAIN, TABLE):
+            model.mat(name).specular[:] = 0.0
+        for number in range(MOST_LIGHTS):
+            light = model.light(f"light {number}")
+            light.active[0] = number < len(look.lights)
+            if number < len(look.lights):
+                told = look.lights[number]
+                towards = unit(told.direction)
+                light.dir[:], light.pos[:] = towards, -LIGHT_M * towards
+                light.diffuse[:], light.specular[:], light.castshadow[0] = told.diffuse, told.specular, told.shadow
+        # Without a material the table is drawn as it always was.
+        material = TABLE if look.table_texture is not None else PLAIN
+        model.geom("table").matid[0] = -1 if look.is_flat else model.mat(material).id
+        if look.table_texture is not None:
+            model.mat(TABLE).texrepeat[:] = 1.0 / look.table_texture_m
+            self._paint(TABLE, look.table_texture)
+        self.renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = look.background is not None
+        if look.background is not None:
+            face = Image.fromarray(look.background).resize((SKY_PX, SKY_PX), Image.Resampling.BOX)
+            self._paint(SKY, np.concatenate([np.asarray(face)] * 6))
+
+    def _paint(self, texture: str, rgb: NDArray[np.uint8]) -> None:
+        """Gives a texture of the model another image [H, W, 3]."""
+        number = self.model.tex(texture).id
+        start = self.model.tex_adr[number]
+        self.model.tex_data[start:start + rgb.size] = np.flipud(rgb).ravel()
+        self.renderer._gl_context.make_current()  # MuJoCo has no other way to upload a texture
+        mujoco.mjr_uploadTexture(self.model, self.renderer._mjr_context, number)
 
     def show_table(self, visible: bool) -> None:
         """Shows or hides the table. It is hidden in the views of the training set, which have a black background."""
