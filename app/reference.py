@@ -15,7 +15,7 @@ import textwrap
 from collections.abc import Iterable, Iterator
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args, get_origin
+from typing import Annotated, Any, get_args, get_origin
 
 from pydantic import BaseModel
 from typer.main import get_command
@@ -118,7 +118,7 @@ def configuration() -> str:
 
 def _keys(section: type[BaseModel], prefix: str) -> list[str]:
     return _table(("key", "default", ""), (
-        (f"`{prefix}{name}`", f"`{json.dumps(field.default, default=str)}`", field.description or "")
+        (f"`{prefix}{name}`", f"`{json.dumps(field.default, default=str)}`", _flat(field.description))
         for name, field in section.model_fields.items()
         if not (inspect.isclass(field.annotation) and issubclass(field.annotation, BaseModel))))
 
@@ -148,13 +148,12 @@ def _commands(command: Any, words: tuple[str, ...]) -> Iterator[tuple[tuple[str,
 
 
 def _name(parameter: Any) -> str:
-    kind = parameter.type_descriptor.annotation
+    from saccade.app.cli.front import word_of
+
     if parameter.param_type_name == "argument":
         return f"`{parameter.metavar or parameter.name.upper()}`"
-    if parameter.is_flag:
-        return f"`{', '.join(parameter.opts)}`"
-    value = "\\|".join(get_args(kind)) if get_origin(kind) is Literal else parameter.metavar or kind.__name__.upper()
-    return f"`{', '.join(parameter.opts)} {value}`"
+    value = word_of(parameter).replace("|", "\\|")
+    return f"`{' '.join([', '.join(parameter.opts), value]).strip()}`"
 
 
 def _default(parameter: Any) -> str:

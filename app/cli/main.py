@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from saccade.app.cli import bench, log, look, replay, run, train
+from saccade.app.cli.front import FrontDoor, command_of
 from saccade.app.run.threads import prefer_one_thread
 from saccade.shared.errors import LINE_LIMIT, SaccadeError, printable
 
@@ -17,7 +18,8 @@ EXIT_ERROR, EXIT_INTERRUPTED = 2, 130
 MENDABLE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO, errno.ENAMETOOLONG,
             errno.EMFILE, errno.ENFILE)
 
-app = typer.Typer(name="saccade", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
+app = typer.Typer(name="saccade", cls=FrontDoor, no_args_is_help=True, add_completion=False,
+                  pretty_exceptions_enable=False)
 
 
 def _tell_version(wanted: bool) -> None:
@@ -54,7 +56,7 @@ def main() -> None:
     """The console script: what the user can mend is one line and exit code 2, Ctrl-C one line and 130."""
     prefer_one_thread()
     try:
-        app()
+        command_of(app)(prog_name="saccade")
     except SaccadeError as error:
         print(f"saccade: {error}", file=sys.stderr)
         sys.exit(EXIT_ERROR)
