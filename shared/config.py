@@ -99,7 +99,11 @@ class SimulatorConfig(Section):
     """`reached`: an episode ends at the first step within the tolerance, as in the paper. `declared`: it ends when the
     agent says that it has arrived."""
     publish_depth: bool = False
-    """Whether frames carry depth. No agent that comes with Saccade needs it."""
+    """Whether frames carry depth. PoseCNN uses it."""
+    look: str = "flat"
+    """Light, surfaces and the camera's faults: the name of a look that comes with Saccade, or a TOML file."""
+    goal_look: str | None = None
+    """The look of the goal image, if it is another one."""
 
 
 class CameraConfig(Section):
@@ -271,10 +275,10 @@ def validate(tree: dict[str, Any], where: str) -> Config:
     return checked(Config, tree, f"configuration key {{}} in {where}")
 
 
-def checked(model: type[Checked], tree: dict[str, Any], what: str) -> Checked:
+def checked(model: type[Checked], tree: dict[str, Any], what: str, context: dict[str, Any] | None = None) -> Checked:
     """Returns the section in a tree. Raises SaccadeError, which begins with `what`; the wrong key replaces its {}."""
     try:
-        return model.model_validate(tree)
+        return model.model_validate(tree, context=context)
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
