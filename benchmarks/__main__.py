@@ -8,8 +8,8 @@ figure is the median of several repetitions on one thread.
 
 from __future__ import annotations
 
+import argparse
 import json
-import sys
 import time
 from collections.abc import Callable
 from functools import partial
@@ -124,6 +124,10 @@ def wire() -> list[dict]:
 
 def main() -> None:
     """Prints a table. With a file's name it writes the numbers there."""
+    parser = argparse.ArgumentParser(prog="python -m saccade.benchmarks",
+                                     description="Measures how cost grows, in some minutes on one thread.")
+    parser.add_argument("out", nargs="?", type=Path, metavar="OUT.json", help="file for the numbers")
+    out = parser.parse_args().out
     torch.set_num_threads(1)
     results = {"perception": perception(), "planning": planning(), "wire": wire()}
     table = Table("what", "ms", "ratio")
@@ -133,8 +137,8 @@ def main() -> None:
             table.add_row(row["what"], f"{row['ms']:.2f}", ratios)
         table.add_section()
     Console().print(table)
-    if len(sys.argv) > 1:
-        Path(sys.argv[1]).write_text(json.dumps(results, indent=1) + "\n")
+    if out is not None:
+        out.write_text(json.dumps(results, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -126,6 +126,8 @@ def test_hz_of_a_log(monkeypatch, capsys, log):
     assert code == 0
     assert "saccade/table/frame: 6 messages, " in out
     assert call(monkeypatch, capsys, "hz", "frame", "--log", log)[1].count("\n") == 1
+    few = call(monkeypatch, capsys, "hz", "frame", "--log", log, "--count", 1)[1]
+    assert few == "saccade/table/frame: 1 message, too few for a rate\n"
 
 
 def test_rates_within_a_window():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import tarfile
 import zipfile
 
 import pytest
@@ -49,6 +50,17 @@ def test_weights_presets_scenes_and_licence_are_in_it(wheel):
 def test_what_is_for_the_repository_alone_is_not_in_it(wheel):
     for room in ("tests", "benchmarks", "examples", "docs", "results", "setup"):
         assert not [name for name in wheel.namelist() if name.startswith(f"saccade/{room}")], room
+
+
+def test_a_source_distribution_has_no_part_of_the_tests(tmp_path):
+    """They need files that are in the repository alone."""
+    subprocess.run([sys.executable, "-m", "build", "--sdist", "--no-isolation", "--outdir", tmp_path, PACKAGE],
+                   check=True, capture_output=True)
+    path, = tmp_path.glob("*.tar.gz")
+    with tarfile.open(path) as file:
+        names = [name.partition("/")[2] for name in file.getnames()]
+    assert "pyproject.toml" in names
+    assert not [name for name in names if name.startswith("tests")]
 
 
 def test_it_knows_the_commit_that_it_was_built_from(wheel):

@@ -25,13 +25,15 @@ def train(*, objects: Objects = None, names: Names = None,
               min=20, max=5000, help="How many views of each object are rendered.")] = None,
           seed: Seed = None, jobs: Annotated[int, typer.Option(
               min=1, help="How many networks are trained at a time.")] = 1,
-          device: Annotated[Literal["auto", "cpu", "cuda"] | None, typer.Option(show_default="auto")] = None,
+          device: Annotated[Literal["auto", "cpu", "cuda"] | None, typer.Option(
+              help="Where to compute: on a GPU if there is one, or always on the named device.",
+              show_default="auto")] = None,
           architecture: Annotated[Literal["default", "paper", "posecnn", "lexa"], typer.Option(
               help="Saccade's networks, those of the paper's tables, PoseCNN, or LEXA. Others than Saccade's go to "
                    "folders named <set>-<architecture>.")] = "default",
           weights: WeightsFolder = None, values: Annotated[list[str] | None, typer.Option(
-              "--set", metavar="KEY=VALUE", help="Set a training setting, such as batch_ccn=64 (see "
-                                                 "training/settings.py).")] = None) -> None:
+              "--set", metavar="KEY=VALUE", help="Set a training setting, such as batch_ccn=64. The guide's page "
+                                                 "'Train networks' names the most important ones.")] = None) -> None:
     """Train the networks of an object set. The same command continues after an interruption."""
     from rich.console import Console
 

@@ -24,6 +24,7 @@ from saccade.shared.bus.topics import Topic
 WINDOW_S = 10.0
 MOST = 10_000  # a window holds at most so many messages of one key
 LINES_EVERY_S = 1.0
+UNKNOWN = "-"
 
 
 @dataclass
@@ -116,7 +117,10 @@ def _tell(console: Console, rates: Rates, world: str, now_s: float = -math.inf) 
 
 def _lines(rows: list[tuple[str, ...]]) -> Iterator[str]:
     for key, count, rate, interval, jitter, size in rows:
-        yield f"{key}: {count} messages, {rate} Hz, every {interval} ms ± {jitter} ms, {size} B/s"
+        if rate == UNKNOWN:
+            yield f"{key}: {count} message{'s' if count != '1' else ''}, too few for a rate"
+        else:
+            yield f"{key}: {count} messages, {rate} Hz, every {interval} ms ± {jitter} ms, {size} B/s"
     if not rows:
         yield "no messages"
 
@@ -133,5 +137,5 @@ def _table(rows: list[tuple[str, ...]]) -> Table:
 def _texts(values: tuple[int, float, float, float, float]) -> tuple[str, ...]:
     count, rate, interval, jitter, size = values
     if math.isnan(rate):
-        return (str(count), *"----")
+        return (str(count), *(4 * [UNKNOWN]))
     return str(count), f"{rate:.2f}", f"{interval * 1e3:.1f}", f"{jitter * 1e3:.1f}", f"{size:,.0f}"
