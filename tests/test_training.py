@@ -30,8 +30,17 @@ TINY = TrainingConfig(objects="pantry", names=NAMES, views=24, steps_ccn=4, step
 def finished(tmp_path_factory):
     """A whole tiny run, by processes, as a user would start it."""
     run_dir = tmp_path_factory.mktemp("run")
-    train(run_dir, TINY, jobs=2, console=Console(quiet=True))
+    with (run_dir / "printed.txt").open("w") as file:
+        train(run_dir, TINY, jobs=2, console=Console(file=file, width=20))
     return run_dir
+
+
+def test_what_is_no_terminal_gets_whole_lines(finished):
+    lines = (finished / "printed.txt").read_text().splitlines()
+    assert "views soup_can: 96 of 96" in lines  # 24 from each of four ranges
+    assert any(line.startswith("soup_can: 4 of 4  ") for line in lines)
+    assert len(lines) == len(set(lines))
+    assert all(" of " in line for line in lines)
 
 
 @pytest.mark.parametrize("part", [EXTRACTION, "soup_can"])

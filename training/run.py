@@ -43,17 +43,23 @@ def start(run_dir: Path, config: TrainingConfig) -> TrainingConfig:
 
 
 def train(run_dir: Path, config: TrainingConfig, *, jobs: int, console: Console) -> None:
-    """Trains every part that is not finished, each in its own process, at most `jobs` at a time.
+    """Trains every part that is not finished, each in its own process, at most `jobs` at a time. Where the console is
+    no terminal, the progress is printed as lines, a line for each tenth of a part.
 
     Raises SaccadeError if the run cannot be started, or if a part fails.
     """
     start(run_dir, config)
     columns = (TextColumn("{task.description:>24}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
                TextColumn("{task.fields[note]}"))
-    with Progress(*columns, console=console) as progress:
+    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
         bars: dict[str, TaskID] = {}
+        tenths: dict[str, int] = {}
 
         def show(name: str, done: int, total: int, note: str = "") -> None:
+            if not console.is_terminal and 10 * done // total > tenths.get(name, -1):
+                tenths[name] = 10 * done // total
+                console.print(f"{name}: {done} of {total}  {note}".rstrip(), markup=False, highlight=False,
+                              soft_wrap=True)
             if name not in bars:
                 bars[name] = progress.add_task(name, total=total, note="")
             progress.update(bars[name], completed=done, note=note)
