@@ -98,7 +98,7 @@ def test_the_labels_of_a_rendered_image_are_the_poses_of_its_objects():
     rng, checked = np.random.default_rng(1), 0
     for n in range(6):
         camera, placed = scenes.scenes.draw(rng)
-        rng.random(3), rng.uniform(size=3), rng.standard_normal((160, 160, 3))  # what an image uses up
+        rng.random(3), rng.uniform(size=3), rng.standard_normal((160, 160, 3), dtype=np.float32)  # what an image uses up
         for which, at, yaw in placed:
             pixel = batch.center[n, which].double().numpy() * 480
             ray = pixel_rays(pixel, INTRINSICS_PX)

@@ -63,8 +63,9 @@ class RenderedScenes:
         for n in range(count):
             camera, placed = self.scenes.draw(rng)
             self.world.place({self.names[which]: (at, yaw) for which, at, yaw in placed}, rng.random(3) * 255)
-            gain, noise = 1 + rng.uniform(-0.08, 0.08, 3), 0.01 * rng.standard_normal(image[n].shape)
-            image[n] = (self.world.render(camera) / 255.0 * gain + noise).clip(0, 1)
+            gain = ((1 + rng.uniform(-0.08, 0.08, 3)) / 255.0).astype(np.float32)
+            noise = rng.standard_normal(image[n].shape, dtype=np.float32)
+            image[n] = (self.world.render(camera) * gain + np.float32(0.01) * noise).clip(0, 1)
             depth[n] = self.world.render_depth(camera)
             for name, mask in self.world.render_masks(camera).items():
                 label[n][mask] = self.names.index(name) + 1

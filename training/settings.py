@@ -21,7 +21,7 @@ PAPER = {"steps_ccn": 5_000, "steps_extraction": 6_000, "batch_ccn": 150, "batch
          "rate_ccn": 5e-4, "rate_extraction": 1.5e-3}
 
 # The defaults of PoseCNN. It has one network for all objects, which counts as phase 2.
-POSECNN = {"steps_extraction": 12_000, "batch_extraction": 16, "rate_extraction": 1e-3}
+POSECNN = {"steps_extraction": 8_000, "batch_extraction": 16, "rate_extraction": 1e-3}
 # The defaults of LEXA: a batch is pieces of 25 images; an episode of 50 steps is lived through every 20 steps.
 LEXA = {"steps_extraction": 20_000, "batch_extraction": 16, "rate_extraction": 2e-4}
 DEFAULTS: dict[str, dict[str, Any]] = {"paper": PAPER, "posecnn": POSECNN, "lexa": LEXA}
