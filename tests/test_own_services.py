@@ -75,6 +75,24 @@ def test_a_planner_of_ones_own_runs_on_the_bus_and_in_one_process_alike(tmp_path
         assert np.array_equal(step.plan.look_at_m, vague.mean_m)  # it is that planner
 
 
+@pytest.mark.parametrize("slot", ["planner", "perception", "belief"])
+@pytest.mark.parametrize("explore", [True, False])
+def test_the_services_of_the_guide_run_on_the_bus_and_in_one_process_alike(tmp_path, slot, explore):
+    (tmp_path / "my_package").mkdir()
+    name = f"my_package/my_{slot}"
+    (tmp_path / f"{name}.py").write_text(code_of("service.md", f"{name}.py"))
+    logs = {}
+    for kind in ("zenoh", "local"):
+        config = Config().with_values(EPISODE | {f"services.{slot}": name.replace("/", "."), "bus.kind": kind,
+                                                 "simulator.max_steps": 3, "scene.explore": explore})
+        run(config, agent="sceneccn", out=tmp_path / kind / "same", plain=True, console=Console(file=io.StringIO()))
+        logs[kind] = logged(tmp_path / kind / "same" / "run.mcap")
+    assert logs["zenoh"] == logs["local"]
+    counts = {topic: len(messages) for (topic, part), messages in logs["local"].items() if part in (None, "rice_box")}
+    assert counts == {"frame": 3, "goal": 1, "truth": 4, "goal_percept": 1, "percept": 3, "belief": 3, "plan": 3,
+                      "action": 3, "result": 1}
+
+
 def test_it_is_measured_and_replayed(tmp_path):
     config = Config().with_values({"scene.names": ["soup_can"], "simulator.max_steps": 3} | GREEDY)
     plan = prepare("sceneccn", config, tmp_path / "greedy.json", limit=1)
