@@ -32,7 +32,7 @@ test-package: .venv/.installed-dev
 # Writes the reference pages anew and builds the guide into site/.
 docs: .venv/.installed-dev
 	.venv/bin/python -m saccade.app.reference docs
-	.venv/bin/mkdocs build --strict
+	EXECUTE_TUTORIAL=true .venv/bin/mkdocs build --strict
 
 fixtures: .venv/.installed-dev
 	.venv/bin/python -m saccade.tests.fixtures.make

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shlex
 import shutil
@@ -37,10 +38,11 @@ class Command(NamedTuple):
     words: tuple[str, ...]
 
 
-def built(folder: Path, site: Path) -> subprocess.CompletedProcess[str]:
-    """MkDocs on a copy of the guide."""
+def built(folder: Path, site: Path, *, execute: bool = False) -> subprocess.CompletedProcess[str]:
+    """MkDocs on a copy of the guide. `make docs` executes the tutorial, too."""
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "-f", folder / "mkdocs.yml", "-d", site]
-    return subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=300)
+    return subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=300,
+                          env=os.environ | {"EXECUTE_TUTORIAL": str(execute).lower()})
 
 
 @pytest.fixture
@@ -104,8 +106,9 @@ def is_key(text: str) -> bool:
 
 
 def test_the_guide_builds_without_a_warning_and_fetches_nothing_from_elsewhere(guide, tmp_path):
-    done = built(guide, tmp_path / "site")
+    done = built(guide, tmp_path / "site", execute=True)
     assert done.returncode == 0, done.stdout
+    assert (tmp_path / "site" / "tutorial" / "index.html").read_text().count('src="data:image/png') == 3
     pages = list((tmp_path / "site").rglob("*.html"))
     assert len(pages) > 20
     fetched = {address for page in pages for address in FETCHES.findall(page.read_text())}
