@@ -111,8 +111,8 @@ def in_world(config: Config, world: str) -> Config:
             raise SaccadeError("camera.source is for a real camera: add `--world camera`, or world='camera' in Python")
         return config
     if scene.file or scene.scene or scene.n_objects or scene.count > 1:
-        raise SaccadeError(f"scenes are the simulator's: with `--world {world}` leave --scenes, --scene, --n-objects "
-                           "and --count out")
+        raise SaccadeError(f"scenes are the simulator's: in the world {world!r} give no scenes file, no scene, and no "
+                           "number of objects or scenes")
     config = config.with_values({"scene.explore": scene.explore or scene.goal_image is None,
                                  "bus.live": config.bus.kind == "zenoh"})
     from_outside = config.services.source is not None
