@@ -97,7 +97,7 @@ class Art:
             self.disc(x + 0.22 * (k - 3) * r * self.height / self.width, y - (0.16, -0.12)[k % 2] * r, 0.11 * r, bits)
 
 
-def _ellipse(x_m: float, y_m: float) -> NDArray[np.float64]:
+def ellipse(x_m: float, y_m: float) -> NDArray[np.float64]:
     """A closed elliptic outline [_SEGMENTS + 1, 2] (metres) with these extents, counter-clockwise from azimuth -pi."""
     angle = np.linspace(-np.pi, np.pi, _SEGMENTS + 1)
     outline = np.stack([np.cos(angle) * x_m / 2, np.sin(angle) * y_m / 2], axis=1)
@@ -105,7 +105,7 @@ def _ellipse(x_m: float, y_m: float) -> NDArray[np.float64]:
     return outline
 
 
-def _rectangle(x_m: float, y_m: float) -> NDArray[np.float64]:
+def rectangle(x_m: float, y_m: float) -> NDArray[np.float64]:
     """A closed rectangular outline [5, 2] (metres), counter-clockwise: front (+x), +y side, back and -y side."""
     return np.array([(1, -1), (1, 1), (-1, 1), (-1, -1), (1, -1)]) * (x_m / 2, y_m / 2)
 
@@ -181,7 +181,7 @@ class Shape:
 
 
 def _coffee_can() -> Mesh:
-    shape = Shape(_ellipse(0.102, 0.102), [(0.97, -0.07), (0.97, 0.056), (1.0, 0.056), (1.0, 0.07)], sunk=0.004)
+    shape = Shape(ellipse(0.102, 0.102), [(0.97, -0.07), (0.97, 0.056), (1.0, 0.056), (1.0, 0.07)], sunk=0.004)
     art, lid = shape.arts(BLUE, SILVER)
     art.rect((0.16, 0, 0.34, 1, SKY))  # -y side: mountains
     art.poly([(0.16, 0.85), (0.22, 0.4), (0.26, 0.62), (0.3, 0.35), (0.34, 0.85)], NAVY)
@@ -210,7 +210,7 @@ def _coffee_can() -> Mesh:
 
 
 def _cereal_box() -> Mesh:
-    shape = Shape(_rectangle(0.072, 0.164), [(1, -0.1065), (1, 0.1065)])
+    shape = Shape(rectangle(0.072, 0.164), [(1, -0.1065), (1, 0.1065)])
     art, lid = shape.arts(RED, ORANGE)
     side, narrow = 0.164 / 0.472, 0.072 / 0.472  # of the way round
     art.rect((0, 0.84, side, 1, ORANGE))  # front
@@ -241,7 +241,7 @@ def _cereal_box() -> Mesh:
 
 
 def _rice_box() -> Mesh:
-    shape = Shape(_rectangle(0.050, 0.094), [(1, -0.088), (1, 0.088)])
+    shape = Shape(rectangle(0.050, 0.094), [(1, -0.088), (1, 0.088)])
     (art, lid), side = shape.arts(WHITE, WHITE), 0.094 / 0.288
     art.rect((0, 0, side, 0.36, GREEN))  # front
     art.text(side / 2, 0.18, "OLANA", 0.135, WHITE)
@@ -270,7 +270,7 @@ def _rice_box() -> Mesh:
 
 def _soup_can() -> Mesh:
     bead = [(1, -0.051), (1, -0.048), (0.97, -0.046)]
-    shape = Shape(_ellipse(0.068, 0.068), bead + [(s, -z) for s, z in reversed(bead)], sunk=0.003)
+    shape = Shape(ellipse(0.068, 0.068), bead + [(s, -z) for s, z in reversed(bead)], sunk=0.003)
     art, lid = shape.arts(WHITE, SILVER)
     art.poly([(0, 0), (1, 0), (1, 0.3), (0, 0.7)], PURPLE)  # the edge falls all the way round
     art.text(0.5, 0.22, "MIRO", 0.25, WHITE)  # front
@@ -298,7 +298,7 @@ def _squeeze_bottle() -> Mesh:
     bend = np.linspace(0, np.pi / 2, 6)
     shoulder = np.c_[0.36 + 0.64 * np.cos(bend), 0.025 + 0.033 * np.sin(bend)]
     cap = [(0.36, 0.064), (0.42, 0.065), (0.38, 0.084), (0.22, 0.0955)]
-    shape = Shape(_ellipse(0.097, 0.067), [(0.9, -0.0955), (1, -0.089), *shoulder, *cap])
+    shape = Shape(ellipse(0.097, 0.067), [(0.9, -0.0955), (1, -0.089), *shoulder, *cap])
     art, lid = shape.arts(YELLOW, BLUE)
     body = 1 - np.interp(0.025, shape.profile[:, 1], shape.t)  # where the shoulder starts, and then the cap
     neck = 1 - np.interp(0.065, shape.profile[:, 1], shape.t)
