@@ -150,7 +150,7 @@ def test_what_an_agent_cannot_use_is_told(change, words):
 @pytest.mark.parametrize(("given", "words"), [
     ((start_pose(), [0, 0], [0, 0, 0]), r"translation_m of shape \[2\]: give 3 finite numbers"),
     ((np.eye(3), [0, 0, 0], [0, 0, 0]), r"world_from_camera of shape \[3, 3\]"),
-    ((start_pose(), [0, 0, 0], [0, 0, np.nan]), "rotation_rad of shape"),
+    ((start_pose(), [0, 0, 0], [0, 0, np.nan]), "rotation_rad is not finite: give 3 finite numbers"),
     ((start_pose(), "x", [0, 0, 0]), "translation_m is 'x'"),
 ])
 def test_an_action_that_is_none_is_told(given, words):

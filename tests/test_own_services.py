@@ -162,6 +162,17 @@ def test_a_core_that_is_none_or_says_nonsense_gets_one_line(tmp_path, bus, made,
     assert "Traceback" not in done.stderr
 
 
+def test_what_says_nonsense_in_a_replay_gets_one_line(tmp_path):
+    text = code_of("service.md", "my_package/my_planner.py").replace("np.zeros(3), rot", "np.full(3, np.nan), rot")
+    (tmp_path / "mine.py").write_text(text)
+    golden = PACKAGE / "tests" / "fixtures" / "golden.mcap"
+    done = subprocess.run([sys.executable, "-m", "saccade", "replay", golden, "--into", "planner", "--bus", "local",
+                           "--set", "services.planner=mine", "--out", tmp_path / "r"],
+                          capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stderr) == (
+        2, "saccade: planner gives an invalid action: translation_m: not finite\n")
+
+
 def test_without_a_word_all_services_are_ours():
     for name in ("simulator", "camera", "perception", "belief", "planner", "evaluator"):
         assert load(name, Config()).service.name == name

@@ -120,7 +120,11 @@ def replay_here(replay: Replay, out: Path, keys: Keys, say: Callable[[str], None
     twins = Twins(outcome.comparison, on_moved)
 
     def publish(output: Output) -> None:
-        payload = encode(output.message)
+        try:
+            payload = encode(output.message)
+        except MessageError as error:
+            maker = next(s.name for s in replay.services if output.topic in s.outputs)
+            raise SaccadeError(f"{maker} gives an invalid {output.topic.name}: {error}") from error
         log.write(output.topic, output.part, payload, sequence=output.message.seq)
         twins.replayed(output.topic, output.part, payload)
 

@@ -77,8 +77,10 @@ def numbers(given: ArrayLike, shape: tuple[int, ...], what: str, need: str) -> A
         array = np.array(given, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise SaccadeError(f"{what} is {told(given)}: give {need}") from error
-    if array.shape != shape or not np.isfinite(array).all():
+    if array.shape != shape:
         raise SaccadeError(f"{what} of shape {list(array.shape)}: give {need}")
+    if not np.isfinite(array).all():
+        raise SaccadeError(f"{what} is not finite: give {need}")
     return array
 
 
