@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import weakref
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -110,18 +111,22 @@ class World:
         self.model.cam_intrinsic[0] = (fx, fy, 0.5 - cx, 0.5 - cy)
         self.intrinsics_px = np.asarray(intrinsics_px, dtype=np.float64)
 
-    def place(self, poses: dict[str, tuple[ArrayLike, float]], table_rgb: ArrayLike = (128, 128, 128)) -> None:
-        """Puts objects at (box centre [3] in metres, yaw in radians). Objects that are not named are out of sight.
+    def place(self, poses: Mapping[str, tuple[ArrayLike, float | NDArray[np.float64]]],
+              table_rgb: ArrayLike = (128, 128, 128)) -> None:
+        """Puts objects at (box centre [3] in metres, yaw in radians or rotation [3, 3]).
 
-        `table_rgb` is from 0 to 255.
+        Objects that are not named are out of sight. `table_rgb` is from 0 to 255.
         """
         self.poses = dict(poses)
         textured = self.look.table_texture is not None
         self.model.geom("table").rgba[:3] = 1.0 if textured else np.asarray(table_rgb) / 255.0
         for name, mocap in self._mocap.items():
-            center, yaw = poses.get(name, (_OUT_OF_SIGHT, 0.0))
+            center, turned = poses.get(name, (_OUT_OF_SIGHT, 0.0))
             self.data.mocap_pos[mocap] = center
-            self.data.mocap_quat[mocap] = (np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2))
+            if isinstance(turned, np.ndarray):
+                mujoco.mju_mat2Quat(self.data.mocap_quat[mocap], np.asarray(turned, dtype=np.float64).ravel())
+            else:
+                self.data.mocap_quat[mocap] = (np.cos(turned / 2), 0.0, 0.0, np.sin(turned / 2))
 
     def set_look(self, look: Look) -> None:
         """Sets lights, the table's surface and the background. It must be set before the objects are placed.

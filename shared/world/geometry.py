@@ -140,6 +140,12 @@ def fibonacci_hemisphere(count: int) -> tuple[Array, Array]:
     return wrap(index * np.pi * (3.0 - np.sqrt(5.0))), np.arcsin(1.0 - index / count)
 
 
+def fibonacci_sphere(count: int) -> Array:
+    """`count` unit vectors [count, 3], spread evenly over the whole sphere."""
+    index = np.arange(count) + 0.5
+    return direction(wrap(index * np.pi * (3.0 - np.sqrt(5.0))), np.arcsin(1.0 - 2.0 * index / count))
+
+
 GRID_ELEVATIONS, GRID_AZIMUTHS = 18, 72  # cells of 5 degrees
 
 

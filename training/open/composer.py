@@ -1,0 +1,146 @@
+"""Crops as a proposer cuts them: an object in any light, on any surface, between others, a little off.
+
+Beside each crop stands the view that a bank has of the object from the same direction.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from saccade.shared.render.surfaces import SURFACES
+from saccade.shared.world.windows import CROP_PX
+from saccade.training.crops import warp
+from saccade.training.open.tiles import Tiles
+
+BACKGROUNDS = 160  # surfaces that are made once
+SCALE, SHIFT, ROLL_RAD = 0.17, 0.10, 0.15  # how wrong a proposal is: log of its side, place in sides, roll
+BESIDE, BEFORE = 0.6, 0.35  # shares of crops with a neighbour behind or beside, and before
+SMALL = 0.35  # share of crops that come from few pixels
+
+
+@dataclass(frozen=True)
+class Crops:
+    """B crops of known objects and the view that a bank has of them.
+
+    seen [B, 4, 64, 64] is the crop with its mask (the last channel), known [B, 4, 64, 64] the flat view from the same
+    direction; object [B] are numbers, direction [B, 3] point from the object to the camera; visible [B] is the share of
+    the object that nothing hides.
+    """
+
+    seen: Tensor
+    known: Tensor
+    object: Tensor
+    direction: Tensor
+    visible: Tensor
+
+
+class CropMaker:
+    """Makes crops of objects. All randomness comes from the generator of each call, but for the surfaces, which are
+    drawn from `seed`."""
+
+    def __init__(self, tiles: list[Tiles], device: torch.device, seed: int = 0):
+        self.tiles, self.device = tiles, device
+        rng = np.random.default_rng(seed)
+        makers = list(SURFACES.values())
+        surfaces = np.stack([makers[n % len(makers)](rng)[::2, ::2] for n in range(BACKGROUNDS)])
+        self.surfaces = torch.from_numpy(surfaces).permute(0, 3, 1, 2).to(device)
+        self.directions = [torch.tensor(t.directions, dtype=torch.float32) for t in tiles]
+
+    def tile(self, which: np.ndarray, index: np.ndarray, variant: np.ndarray) -> Tensor:
+        """Tiles [B, 4, 80, 80] from 0 to 1."""
+        chosen = np.stack([self.tiles[o].images[n, v] for o, n, v in zip(which, index, variant, strict=True)])
+        return torch.from_numpy(chosen).to(self.device).permute(0, 3, 1, 2).float() / 255.0
+
+    def draw(self, which: np.ndarray, index: np.ndarray, rng: np.random.Generator) -> Crops:
+        """Crops of the objects `which` [B], seen from the directions `index` [B]."""
+        count = len(which)
+        generator = torch.Generator(self.device).manual_seed(int(rng.integers(2 ** 62)))
+
+        def uniform(*shape: int) -> Tensor:
+            return torch.rand(*shape, generator=generator, device=self.device)
+
+        variants = np.array([rng.integers(self.tiles[o].images.shape[1]) for o in which])
+        mine = self.tile(which, index, variants)
+        scale = ((uniform(count) * 2 - 1) * SCALE).exp()
+        shift, roll = (uniform(count, 2) * 2 - 1) * 2 * SHIFT, (uniform(count) * 2 - 1) * ROLL_RAD
+        whole = warp(mine, shift, scale, roll)
+        image = self._background(count, uniform)
+        image = self._over(image, self._neighbour(which, rng, uniform) * (uniform(count) < BESIDE)[:, None, None, None])
+        image = self._shadowed(image, whole[:, 3:], uniform)
+        image, alpha = self._over(image, whole), whole[:, 3:]
+        before = self._neighbour(which, rng, uniform, away=0.75) * (uniform(count) < BEFORE)[:, None, None, None]
+        image, alpha = self._over(image, before), alpha * (1 - before[:, 3:])
+        visible = alpha.sum((1, 2, 3)) / whole[:, 3].sum((1, 2)).clamp(min=1.0)
+        mask = self._found(alpha, before[:, 3:], uniform)
+        image = self._camera(image, uniform)
+        flat = self.tile(which, index, np.zeros(count, dtype=int))
+        known = F.interpolate(flat, size=(CROP_PX, CROP_PX), mode="area")
+        direction = torch.stack([self.directions[o][n] for o, n in zip(which, index, strict=True)]).to(self.device)
+        return Crops(torch.cat([image, mask], dim=1), known, torch.as_tensor(which, device=self.device), direction,
+                     visible)
+
+    @staticmethod
+    def _over(below: Tensor, layer: Tensor) -> Tensor:
+        return layer[:, :3] + below * (1 - layer[:, 3:])
+
+    def _background(self, count: int, uniform) -> Tensor:
+        """Surfaces as a crop shows them, or a colour [B, 3, 64, 64]."""
+        chosen = (uniform(count) * len(self.surfaces)).long()
+        surface = self.surfaces[chosen].float() / 255.0
+        zoom, turn = 0.15 + 0.6 * uniform(count), uniform(count) * 2 * np.pi
+        place = (uniform(count, 2) * 2 - 1) * (1 - zoom)[:, None]
+        cos, sin = zoom * turn.cos(), zoom * turn.sin()
+        rows = torch.stack([torch.stack([cos, -sin, place[:, 0]], -1), torch.stack([sin, cos, place[:, 1]], -1)], 1)
+        grid = F.affine_grid(rows, [count, 3, CROP_PX, CROP_PX], align_corners=False)
+        textured = F.grid_sample(surface, grid, padding_mode="reflection", align_corners=False)
+        plain = uniform(count, 3, 1, 1).expand(-1, -1, CROP_PX, CROP_PX)
+        return torch.where((uniform(count) < 0.7)[:, None, None, None], textured, plain)
+
+    def _neighbour(self, which: np.ndarray, rng: np.random.Generator, uniform, away: float = 0.35) -> Tensor:
+        """Other objects [B, 4, 64, 64] at least `away` half sides from the centre."""
+        others = (which + rng.integers(1, len(self.tiles), len(which))) % len(self.tiles)
+        index = np.array([rng.integers(len(self.tiles[o].images)) for o in others])
+        variant = np.array([rng.integers(self.tiles[o].images.shape[1]) for o in others])
+        angle, far = uniform(len(which)) * 2 * np.pi, away + 0.8 * uniform(len(which))
+        center = torch.stack([angle.cos() * far, angle.sin() * far], dim=1)
+        return warp(self.tile(others, index, variant), center, 0.6 + 0.7 * uniform(len(which)),
+                    (uniform(len(which)) * 2 - 1) * 0.3)
+
+    def _shadowed(self, image: Tensor, alpha: Tensor, uniform) -> Tensor:
+        """A blurred copy of the object's outline, moved aside, darkens what is behind it."""
+        count = len(image)
+        moved = warp(alpha, (uniform(count, 2) * 2 - 1) * 0.5, 0.8 + 0.4 * uniform(count), uniform(count) * 0.5)
+        soft = F.avg_pool2d(moved, 7, 1, 3)
+        return image * (1 - soft * (uniform(count) * 0.6)[:, None, None, None])
+
+    def _found(self, alpha: Tensor, before: Tensor, uniform) -> Tensor:
+        """A mask as a proposer finds it: soft, grown or shrunk, bitten, and leaking into what stands before it."""
+        count = len(alpha)
+        pick = uniform(count)[:, None, None, None]
+        grown, shrunk = F.max_pool2d(alpha, 5, 1, 2), -F.max_pool2d(-alpha, 5, 1, 2)
+        mask = torch.where(pick < 0.2, grown, torch.where(pick < 0.4, shrunk, alpha))
+        leak = F.interpolate((uniform(count, 1, 4, 4) < 0.12).float(), size=(CROP_PX, CROP_PX), mode="bilinear")
+        bite = F.interpolate((uniform(count, 1, 5, 5) < 0.08).float(), size=(CROP_PX, CROP_PX), mode="bilinear")
+        mask = (mask + before * leak).clamp(0, 1) * (1 - bite)
+        return F.avg_pool2d(mask, 3, 1, 1)
+
+    def _camera(self, image: Tensor, uniform) -> Tensor:
+        """Exposure, colours, gamma, few pixels, blur and noise."""
+        count = len(image)
+
+        def each(low: float, high: float) -> Tensor:
+            return (low + (high - low) * uniform(count))[:, None, None, None]
+
+        image = image.clamp(1e-4, 1) ** each(0.75, 1.35) * each(0.55, 1.3)
+        image = image * (0.82 + 0.36 * uniform(count, 3, 1, 1))
+        coarse = F.interpolate(F.interpolate(image, size=(20, 20), mode="area"), size=image.shape[-2:], mode="bilinear")
+        half = F.interpolate(F.interpolate(image, size=(36, 36), mode="area"), size=image.shape[-2:], mode="bilinear")
+        pick = uniform(count)[:, None, None, None]
+        image = torch.where(pick < SMALL / 3, coarse, torch.where(pick < SMALL, half, image))
+        noise = (uniform(*image.shape) - 0.5) * 12 ** 0.5
+        return (image + noise * each(0, 0.04)).clamp(0, 1)
