@@ -179,19 +179,19 @@ def test_files_are_replaced_all_or_none(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS, errno.EACCES])
 def test_the_front_door_tells_what_no_command_has_told(monkeypatch, capsys, number):
-    def fail():
+    def fail(**_more):
         raise OSError(number, os.strerror(number), "/tmp/\x1b[31m")
 
-    monkeypatch.setattr(cli, "app", fail)
+    monkeypatch.setattr(cli, "command_of", lambda app: fail)
     code, _, err = call(monkeypatch, capsys)
     assert code == 2
     assert err == f"saccade: /tmp/\\x1b[31m: {os.strerror(number)}: free some space, or name another place\n"
 
 
 def test_a_fault_of_ours_stays_a_fault(monkeypatch):
-    def fail():
+    def fail(**_more):
         raise OSError(errno.EBADF, os.strerror(errno.EBADF))
 
-    monkeypatch.setattr(cli, "app", fail)
+    monkeypatch.setattr(cli, "command_of", lambda app: fail)
     with pytest.raises(OSError, match="Bad file descriptor"):
         cli.main()
