@@ -44,4 +44,7 @@ def told(value: object) -> str:
     """Returns a value from outside as an error names it: a text in quotes, and only a part of what is long or deep."""
     if isinstance(value, str):
         return f"'{printable(value, NAME_LIMIT)}'"
-    return printable(reprlib.repr(value), NAME_LIMIT)
+    try:
+        return printable(reprlib.repr(value), NAME_LIMIT)
+    except ValueError:  # Python writes no number with thousands of digits
+        return "a number that is too large"

@@ -12,7 +12,7 @@ from typer.core import TyperGroup
 from typer.exceptions import TyperException
 from typer.main import get_command
 
-from saccade.shared.errors import SaccadeError, printable
+from saccade.shared.errors import NAME_LIMIT, SaccadeError, printable
 from saccade.shared.wording import plain
 
 _WORDS = {int: "N", float: "N", str: "TEXT", Path: "PATH"}
@@ -56,7 +56,7 @@ def _said(error: TyperException) -> str:
         return f"{name}: {printable(error.message)}: {where}"
     choices = parameter.type_descriptor.choices
     need = f"choose from {', '.join(map(str, choices))}" if choices else plain(wrong)
-    return f"{name} {printable(str(wrong['input']))}: {need}"
+    return f"{name} {printable(str(wrong['input']), NAME_LIMIT)}: {need}"
 
 
 def name_of(parameter: Any) -> str:
