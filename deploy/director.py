@@ -24,7 +24,8 @@ from rich.console import Console
 
 from saccade.app.cli.texts import configured, numbers
 from saccade.app.run.display import LINE_EVERY, Progress, line, say
-from saccade.app.run.launch import follow, messages, resolve
+from saccade.app.run.follow import Messages, follow
+from saccade.app.run.launch import resolve
 from saccade.app.run.registry import AGENTS, DEFAULT_AGENT, DEFAULT_WORLD, WORLDS, agent_processes, world_of
 from saccade.app.run.summary import summary
 from saccade.app.run.supervisor import HUNG_S, Process
@@ -144,7 +145,7 @@ def _follow(folder: Path, processes: Sequence[Process], console: Console, worlds
         bus.subscribe((view, *SHOWN), lambda *item: arrived.put(item))
         # Not the router, which only the first world hears
         elsewhere = Elsewhere([process.name for process in processes[1:]], tell)
-        told = messages(arrived, bus, elsewhere, config.run or folder.name, tell)
+        told = Messages(arrived, bus, elsewhere, config.run or folder.name, tell)
         results = follow(told, elsewhere, processes, on_message, live=config.bus.live)
     for text in summary(config, results, progress):
         tell(text)

@@ -182,9 +182,10 @@ def test_malformed_messages_are_counted_said_and_survived(name, topic):
             running.until_status(name, lambda s: "'stranger' is not an object" in s.note)
             running.listener.publish(topic, part, encode(sample(topic.type, object="can")))
             running.until_status(name, lambda s: "object: 'can'" in s.note)
+        ready = encode(sample(Status, run="", service="nobody", state="ready"))
         for service in SERVICES:
             if service != "simulator":
-                running.listener.publish(STATUS, "nobody", encode(sample(Status, service="nobody", state="ready")))
+                running.listener.publish(STATUS, "nobody", ready)
         seen = running.until(lambda t, p, b: t == RESULT and decode(t.type, b).episode == CONFIG.scene.count - 1)
         assert by_key(e for e in seen if e[0] == RESULT)[("result", None)] == locally(encoded=True)["result", None]
 
@@ -196,7 +197,7 @@ def test_a_stray_message_of_another_run_or_step_does_not_stop_the_loop():
             running.listener.publish(topic, part, encode(sample(topic.type, run="other", step=9, object=part)))
         running.until_status("planner", lambda s: s.refused == 1 and "belief/mug: run: 'other', not this" in s.note)
         running.listener.publish(ACTION, None, encode(sample(ACTION.type, run="r", episode=0, step=4)))
-        running.listener.publish(STATUS, "nobody", encode(sample(Status, service="nobody", state="ready")))
+        running.listener.publish(STATUS, "nobody", encode(sample(Status, run="", service="nobody", state="ready")))
         seen = running.until(lambda t, p, b: t == RESULT and decode(t.type, b).episode == CONFIG.scene.count - 1)
         assert by_key(e for e in seen if e[0] == RESULT)[("result", None)] == locally(encoded=True)["result", None]
 
@@ -206,7 +207,7 @@ def test_the_source_begins_when_everyone_is_ready():
         running.until_status("simulator", lambda s: "perception, planner" in s.note)
         for name, state in (("perception", "ready"), ("planner", "starting"), ("planner", "busy")):
             assert running.health == {}
-            running.listener.publish(STATUS, name, encode(sample(Status, service=name, state=state)))
+            running.listener.publish(STATUS, name, encode(sample(Status, run="", service=name, state=state)))
         seen = running.until(lambda t, p, b: t == FRAME)
         states = [decode(Status, b).state for t, p, b in seen if t == STATUS and p == "planner"]
         assert states == ["starting", "busy"]

@@ -8,38 +8,26 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
-from saccade.app.run.halt import Pulse
+from saccade.app.run.follow import FOLLOWED, JUDGE, READY_S, Messages, OnMessage, follow
 from saccade.app.run.supervisor import Process, Supervisor
 from saccade.services.recorder.core import complete
-from saccade.shared.bus.messages import Message, Result, Status
-from saccade.shared.bus.sequences import Sequences
-from saccade.shared.bus.topics import PLAN, RESULT, STATUS, Topic
+from saccade.shared.bus.messages import Result, Status
+from saccade.shared.bus.topics import Topic
 from saccade.shared.bus.transport import Bus, ZenohBus, free_endpoint
-from saccade.shared.bus.wire import MessageError, decode
 from saccade.shared.config import Config
 from saccade.shared.errors import LINE_LIMIT, SaccadeError, printable
 from saccade.shared.log.folder import CONFIG_NAME, LOG_NAME, LOGS_NAME
 from saccade.shared.log.reading import is_whole
-from saccade.shared.loop.main import READY_STATES
+from saccade.shared.loop.episodes import READY_STATES
 from saccade.shared.loop.process import Item
 from saccade.shared.render.objects import names_of
 
-Told = tuple[Topic, str | None, Message]
-OnMessage = Callable[[Topic, str | None, Message], None]
-FOLLOWED = (STATUS, PLAN, RESULT)  # these topics tell the launcher how far a run is
-READY_S = 120.0  # on a busy machine it takes long to load weights
 CONNECT_S = 10.0  # a router on this machine answers at once
-POLL_S = 0.2
-MOST_STRANGERS = 20  # other runs that are named
-# After so long without news the launcher asks for results: one may have been published while the router was away.
-QUIET_S = 2.0
-WORKED_OFF_S = 10.0  # If nobody judges: after so long without news the plan for the last frame will not come any more.
-JUDGE, RECORDER = "evaluator", "recorder"
+RECORDER = "recorder"
 
 # The router, then the others in the order in which the data passes them.
 ROUTER, *SERVICES = PROCESSES = tuple(Process(name, f"saccade.services.{name}") for name in (
@@ -83,7 +71,9 @@ def launched(config: Config, run_dir: Path, on_message: OnMessage | None = None,
     with running(config, run_dir, processes, wanted if wanted is None else {*wanted, *FOLLOWED}, say) as graph:
         results = follow(graph.messages, graph.supervisor, processes, on_message, live=config.bus.live)
         graph.supervisor.stop(onlookers=False)
-        _drain(graph.messages, on_message)
+        if on_message is not None:
+            for item in graph.messages.rest():
+                on_message(*item)
         lacks = graph.supervisor.complaints()  # such as a full disk
         if graph.supervisor.was_killed(RECORDER) and not is_whole(run_dir / LOG_NAME):
             complete(run_dir, config)
@@ -94,30 +84,13 @@ def launched(config: Config, run_dir: Path, on_message: OnMessage | None = None,
         yield Ended(results, graph.supervisor.runs, tuple(lacks))
 
 
-class Watch(Protocol):
-    """What knows the state of the services of a run: their supervisor, or an object that only hears their
-    heartbeats."""
-
-    stopped: bool
-
-    def heard(self, name: str, state: str) -> None:
-        """Takes a heartbeat."""
-
-    def check(self) -> None:
-        """It must be called a few times a second."""
-
-    def settled(self, since_s: float) -> bool:
-        """Whether all services were heard since that time (monotonic clock, seconds)."""
-
-
 @dataclass(frozen=True)
 class Graph:
-    """Processes that run, and a client on their bus. `messages` yields (topic, part, message) as they arrive, each
-    once, and None when nothing arrived. While it is iterated, the processes are watched."""
+    """Processes that run, and a client on their bus. While `messages` is iterated, the processes are watched."""
 
     bus: Bus
     supervisor: Supervisor
-    messages: Iterator[Told | None]
+    messages: Messages
 
 
 @contextmanager
@@ -138,7 +111,7 @@ def running(config: Config, run_dir: Path, processes: Sequence[Process], topics:
         bus = _connected(config, supervisor)
         stack.callback(bus.close)
         bus.subscribe(topics, lambda *item: arrived.put(item))
-        stream = messages(arrived, bus, supervisor, config.run or run_dir.name, say)
+        stream = Messages(arrived, bus, supervisor, config.run or run_dir.name, say)
         _await_router(stream, processes[0])
         for process in processes[1:]:
             supervisor.start(process)
@@ -175,111 +148,13 @@ def _prepare(run_dir: Path) -> None:
         raise SaccadeError(f"run folder {run_dir} cannot be made: {error.strerror}") from error
 
 
-def messages(arrived: queue.SimpleQueue[Item], bus: Bus, watch: Watch, run: str,
-             say: Callable[[str], None]) -> Iterator[Told | None]:
-    """Yields (topic, part, message) as they arrive, each once, and None when nothing arrived. Messages of other runs
-    are ignored; `say` is told of each such run once."""
-    strangers: set[str] = set()
-    sequences, looked_s, news_s = Sequences(), time.monotonic(), time.monotonic()
-    while True:
-        now_s = time.monotonic()
-        if now_s - looked_s >= POLL_S:
-            looked_s = now_s
-            watch.check()
-        if now_s - news_s >= QUIET_S and not watch.stopped:
-            news_s = now_s
-            for topic, part, payload, *_ in bus.recall((RESULT,), (run, 0, 0)):
-                arrived.put((topic, part, payload))
-        item: Told | None = None
-        with suppress(queue.Empty, MessageError):  # a service that gets an invalid message counts it
-            topic, part, payload = arrived.get(timeout=POLL_S)
-            message = decode(topic.type, payload)
-            if isinstance(message, Status):
-                if part is not None:
-                    watch.heard(part, message.state)
-            elif message.run != run:
-                if message.run not in strangers and len(strangers) < MOST_STRANGERS:
-                    strangers.add(message.run)
-                    say(f"a {topic.name} of another run, {message.run!r}, came on the bus: such messages are ignored")
-                continue
-            if sequences.take(topic, part, message) is not None:
-                item = (topic, part, message)
-                news_s = news_s if topic == STATUS else now_s
-        yield item
-
-
-def _await_router(messages: Iterator[Told | None], router: Process) -> None:
+def _await_router(messages: Messages, router: Process) -> None:
     deadline_s = time.monotonic() + READY_S
     for item in messages:
         if item and item[1] == router.name and isinstance(item[2], Status) and item[2].state in READY_STATES:
             return
         if time.monotonic() > deadline_s:
             raise SaccadeError(f"{router.name}: not ready after {READY_S:.0f} s; see {LOGS_NAME}/")
-
-
-def follow(told: Iterable[Told | None], watch: Watch, processes: Sequence[Process],
-           on_message: OnMessage | None, *, live: bool) -> list[Result]:
-    """Follows a run until it is over, and returns its results in the order of the episodes. Raises SaccadeError if a
-    service is not ready within READY_S, or if all services wait for one another; `live`, they may wait for a camera."""
-    starting = {process.name for process in processes[1:] if not process.onlooker}
-    pulse = Pulse(set() if live else set(starting))
-    course = _Course(processes[1].name, judged=JUDGE in starting)
-    over_s, deadline_s = None, time.monotonic() + READY_S
-    for item in told:
-        if starting and time.monotonic() > deadline_s:
-            raise SaccadeError(f"{', '.join(sorted(starting))}: not ready after {READY_S:.0f} s; see {LOGS_NAME}/")
-        over_s = (over_s or time.monotonic()) if course.over else None
-        if over_s is not None and watch.settled(over_s):
-            break
-        if over_s is None and (why := pulse.halted()):
-            raise SaccadeError(why)
-        if item is None:
-            continue
-        topic, part, message = item
-        if on_message is not None:
-            on_message(topic, part, message)
-        course.take(topic, part, message)
-        pulse.take(topic, part, message)
-        if isinstance(message, Status) and part is not None and message.state in READY_STATES:
-            starting.discard(part)
-    return [course.results[episode] for episode in sorted(course.results)]
-
-
-class _Course:
-    """Keeps track of how far a run has come."""
-
-    def __init__(self, source: str, *, judged: bool) -> None:
-        self.results: dict[int, Result] = {}
-        self._source, self._judged = source, judged
-        self._end: tuple[int, int] | None = None  # the last episode and step of the source
-        self._planned, self._news_s = (-1, -1), time.monotonic()
-
-    def take(self, topic: Topic, part: str | None, message: Message) -> None:
-        """Takes any message."""
-        if topic.in_step:
-            self._news_s = time.monotonic()
-        if isinstance(message, Result):
-            self.results[message.episode] = message
-        elif topic == PLAN:
-            self._planned = max(self._planned, (message.episode, message.step))
-        elif isinstance(message, Status) and part == self._source and message.state == "finished":
-            self._end = (message.episode, message.step)
-
-    @property
-    def over(self) -> bool:
-        """Whether the source has finished and every episode has its result. If nobody judges, the last frame must have
-        its plan instead."""
-        if self._end is None:
-            return False
-        if self._judged:
-            return len(self.results) > self._end[0]
-        return self._planned >= self._end or time.monotonic() - self._news_s > WORKED_OFF_S
-
-
-def _drain(messages: Iterator[Told | None], on_message: OnMessage | None) -> None:
-    """Takes the messages that were still on their way when the services were stopped."""
-    while on_message is not None and (item := next(messages)) is not None:
-        on_message(*item)
 
 
 @contextmanager

@@ -84,14 +84,16 @@ class _Feed:
     """Passes each valid message to the viewer, once."""
 
     def __init__(self, viewer: Viewer, health: Health) -> None:
-        self.viewer, self._health = viewer, health
+        self.viewer, self._health, self._run = viewer, health, health.at[0]
         self._sequences = Sequences()
 
     def take(self, topic: Topic, part: str | None, payload: bytes) -> None:
-        """Decodes a message and passes it on, unless it is not valid or has been passed on before."""
+        """Decodes a message and passes it on, unless it is not valid, is of another run, or was passed on before."""
         self._health.received += 1
         with suppress(MessageError):  # the services that compute with the message count it as refused
             message = decode(topic.type, payload)
+            if self._run and message.run != self._run and (topic != STATUS or message.run):
+                return
             lost = self._sequences.take(topic, part, message)
             if lost is None:
                 return

@@ -16,12 +16,13 @@ import re
 import socket
 import threading
 from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
-from saccade.shared.bus.outbox import PAGE_BYTES, Kept, Since
+from saccade.shared.bus.outbox import KEPT_BYTES, PAGE_BYTES, Kept, Since
 from saccade.shared.bus.topics import ROOT, Topic, parse_key
 from saccade.shared.bus.wire import MessageError, stamp_of
 from saccade.shared.errors import SaccadeError
+from saccade.shared.files import parse_json
 
 if TYPE_CHECKING:
     import zenoh
@@ -31,6 +32,7 @@ Answer = Callable[[Iterable[Topic], Since | None, int], list[Kept]]
 Met = Callable[[frozenset[str]], None]
 
 ROUTER_WAIT_VARIABLE, ROUTER_S = "SACCADE_ROUTER_S", 10.0
+MAX_QUESTION_BYTES, MOST_QUESTIONS = 16 * 1024, 1000  # of one question; and how many wait for their answer
 RECALL_S = 3.0  # a whole answer must come within this time, so that a publisher that hangs does not block others
 
 
@@ -189,7 +191,8 @@ class ZenohBus:
     def answer(self, topics: Iterable[Topic], answer: Answer) -> None:
         """Answers on a thread of its own, because Zenoh's thread must not wait."""
         def ask(topic: Topic, query: zenoh.Query) -> None:
-            self._questions.put((topic, query))
+            if self._questions.qsize() < MOST_QUESTIONS:  # what is beyond gets an empty answer, and is asked again
+                self._questions.put((topic, query))
 
         self._queryables += [self._session.declare_queryable(topic.key(self._world), functools.partial(ask, topic))
                              for topic in topics]
@@ -198,16 +201,10 @@ class ZenohBus:
     def _answer_all(self, answer: Answer) -> None:
         while (asked := self._questions.get()) is not None:
             topic, query = asked
-            # the service that asked may be gone, or its question may not be valid
-            with contextlib.suppress(self._zenoh.ZError, ValueError, TypeError, KeyError):
-                question: dict[str, Any] = {"since": None, "limit": 0}
-                if query.payload:
-                    question = json.loads(query.payload.to_bytes())
-                since = None
-                if question["since"]:
-                    run, episode, step = question["since"]
-                    since = str(run), int(episode), int(step)
-                for kept in answer((topic,), since, int(question["limit"])):
+            # The service that asked may be gone, or its question may be anything. The next one must be answered.
+            with contextlib.suppress(Exception):
+                since, limit_bytes = _asked(query.payload.to_bytes() if query.payload else b"")
+                for kept in answer((topic,), since, limit_bytes):
                     query.reply(topic.key(self._world, kept.part), kept.payload,
                                 attachment=str(kept.published_ns).encode())
             del asked, query  # Zenoh ends a query when its object is deleted
@@ -261,6 +258,26 @@ class ZenohBus:
             entity.undeclare()
         with contextlib.suppress(self._zenoh.ZError):  # the other side is suspended; nobody waits for it
             self._session.close()
+
+
+def _asked(payload: bytes) -> tuple[Since | None, int]:
+    """Returns what a question asks for: since when, and how many bytes at most. Raises ValueError, TypeError or
+    KeyError if it is not a question."""
+    if not payload:
+        return None, 0
+    if len(payload) > MAX_QUESTION_BYTES:
+        raise ValueError(f"a question of {len(payload)} bytes")
+    question = parse_json(payload.decode())
+    limit_bytes, since = question["limit"], question["since"]
+    if type(limit_bytes) is not int:
+        raise ValueError("its limit is not a whole number")
+    limit_bytes = min(max(limit_bytes, 0), KEPT_BYTES)
+    if since is None:
+        return None, limit_bytes
+    run, episode, step = since
+    if [type(value) for value in since] != [str, int, int]:
+        raise ValueError("it does not say since when")
+    return (run, episode, step), limit_bytes
 
 
 def free_endpoint(endpoint: str) -> str:

@@ -10,7 +10,6 @@ from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
-from saccade.shared.bus.messages import Message
 from saccade.shared.bus.outbox import Outbox
 from saccade.shared.bus.sequences import Sequences
 from saccade.shared.bus.topics import STATUS, Output, Topic
@@ -18,6 +17,8 @@ from saccade.shared.bus.transport import Bus, ZenohBus
 from saccade.shared.bus.wire import MessageError, decode, encode, stamp_of
 from saccade.shared.config import Config
 from saccade.shared.errors import SaccadeError
+from saccade.shared.loop.episodes import READY_STATES as READY_STATES
+from saccade.shared.loop.episodes import Episodes, stranger
 from saccade.shared.loop.modules import ServiceModule, load
 from saccade.shared.loop.process import DRAIN_S, Health, Heartbeat, Inbox, run_process
 from saccade.shared.loop.replicas import JOIN_S, MEET_S, Share, alone_on
@@ -25,7 +26,6 @@ from saccade.shared.loop.service import Core, Service
 from saccade.shared.loop.stepper import Stepper
 from saccade.shared.loop.ticker import Ticker
 
-READY_STATES = ("ready", "busy")
 IDLE_S = 1.0  # after this time without a message a service asks for what it lacks, and says so
 WAITS = "waits for "
 
@@ -102,7 +102,7 @@ class _Loop:
 
     def __init__(self, stepper: Stepper, bus: Bus, run: str, wait_for: tuple[str, ...], *, live: bool) -> None:
         service, core = stepper.service, stepper.core
-        self.health, self.outbox, self.awaited = Health(service.name), Outbox(), set(wait_for)
+        self.health, self.outbox = Health(service.name), Outbox()
         self.topics = service.inputs + ((service.closed_by,) if service.closed_by else ())
         self._source = stepper.episode_done  # a source begins between two episodes
         self._stepper, self._bus, self._run, self._service = stepper, bus, run, service
@@ -112,9 +112,14 @@ class _Loop:
         share = self._share = Share(service, stepper.parts) if service.divisible and not live else None
         if share:
             stepper.is_due = lambda at: share.lacks(core.names, at)
-        self._next_episode, self._closed = 0, -1
+        self._episodes = Episodes(core.episodes if self._source else 0, run, wait_for,
+                                  closed=service.closed_by is not None, timed=stepper.timed)
         self._refused: set[Topic] = set()
-        self._end = core.episodes if self._source else 0
+
+    @property
+    def awaited(self) -> set[str]:
+        """The services that a source still waits for."""
+        return self._episodes.awaited
 
     @property
     def watched(self) -> tuple[Topic, ...]:
@@ -180,24 +185,29 @@ class _Loop:
         self.health.received += 1
         try:
             message = decode(topic.type, payload)
+            if topic == self._service.closed_by:
+                self._episodes.close(message)
+            else:
+                self._stepper.offer(topic, part, message)
             self.health.gaps += self._sequences.take(topic, part, message) or 0
             if topic == self._service.closed_by:
-                self._close(message)
-                return
-            self._stepper.offer(topic, part, message)
+                self.begin_if_due()
         except MessageError as error:
-            self.health.refuse(topic, part, error)
-            if topic not in self._refused:  # printed once per topic, for the log of the process
-                self._refused.add(topic)
-                print(f"saccade: {self.health.service}: {self.health.note}", file=sys.stderr, flush=True)
+            self._refuse(topic, part, error)
+
+    def _refuse(self, topic: Topic, part: str | None, reason: object) -> None:
+        self.health.refuse(topic, part, reason)
+        if topic not in self._refused:  # printed once per topic, for the log of the process
+            self._refused.add(topic)
+            print(f"saccade: {self.health.service}: {self.health.note}", file=sys.stderr, flush=True)
 
     def begin_if_due(self) -> None:
         """Begins a source's next episode if all services are ready and the last episode is over and closed."""
-        while self._source and not self.awaited and self._stepper.episode_done and self._is_closed:
-            if self._next_episode >= self._end:
+        while self._source and self._stepper.episode_done and self._episodes.may_begin:
+            episode = self._episodes.begin()
+            if episode is None:
                 self.health.say("finished")
                 return
-            episode, self._next_episode = self._next_episode, self._next_episode + 1
             self._step(None, None, partial(self._stepper.begin, self._run, episode))
             if self._ticker:
                 self._ticker.start()
@@ -235,31 +245,17 @@ class _Loop:
         if lacks := self._stepper.waits_for():
             self.health.say(note=WAITS + ", ".join(lacks))
 
-    @property
-    def _is_closed(self) -> bool:
-        return self._service.closed_by is None or self._closed >= self._next_episode - 1
-
-    def _close(self, message: Message) -> None:
-        if message.run == self._run:
-            self._closed = max(self._closed, message.episode)
-            self.begin_if_due()
-
     def _note_status(self, part: str | None, payload: bytes) -> None:
         try:
             status = decode(STATUS.type, payload)
         except MessageError:
             return  # the service that sent it does not count as ready
-        if part in self.awaited and status.state in READY_STATES:
-            self.awaited.discard(part)
-            if status.run == self._run:  # this source was started again: the others are in that episode already
-                past = 1 if self._ticker else 0  # a source that goes by time cannot repeat its frames
-                self._next_episode = max(self._next_episode, status.episode + past)
-                self._closed = self._next_episode - 1
-                self._end = self._stepper.core.episodes + past * self._next_episode
-            if not self.awaited:
-                self.health.say(note=self.notes)
-                self.begin_if_due()
-                self.catch_up()
+        if (reason := stranger(status, part, self._run)) is not None:
+            self._refuse(STATUS, part, reason)
+        elif self._episodes.heard(part, status):
+            self.health.say(note=self.notes)
+            self.begin_if_due()
+            self.catch_up()
 
     def _step(self, topic: Topic | None, part: str | None, make: Callable[[], list[Output] | None]) -> bool:
         """Runs the core once and publishes its outputs. Returns whether there was anything to do."""
@@ -276,7 +272,7 @@ class _Loop:
         except MessageError as error:
             if topic is None:
                 name = self.health.service
-                raise SaccadeError(f"{name} cannot begin episode {self._next_episode - 1}: {error}") from error
+                raise SaccadeError(f"{name} cannot begin episode {self._episodes.current}: {error}") from error
             self.health.refuse(topic, part, error)
         finally:
             self.health.state = before

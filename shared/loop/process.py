@@ -18,7 +18,7 @@ from pathlib import Path
 from saccade.shared.bus.messages import Status
 from saccade.shared.bus.topics import STATUS, Topic
 from saccade.shared.bus.transport import Bus
-from saccade.shared.bus.wire import encode
+from saccade.shared.bus.wire import MessageError, encode
 from saccade.shared.config import Config, load
 from saccade.shared.errors import SaccadeError
 
@@ -30,6 +30,7 @@ QUIET_S = 0.1
 DRAIN_S = 1.0
 EXIT_ERROR = 2
 NOTE_LENGTH = 1000
+MOST_COUNTED = 2 ** 63 - 1  # the largest number that a message can hold
 REFUSED = "refused: "
 STARTING = "starting"
 HEARTBEAT_VARIABLE = "SACCADE_HEARTBEAT"  # names a file whose age and text show the state to others
@@ -130,9 +131,10 @@ class Health:
     def status(self, seq: int) -> Status:
         """Returns the status message for the bus."""
         run, episode, step = self.at
-        return Status(run=run, episode=episode, step=step, seq=seq, service=self.service, state=self.state,
-                      received=self.received, published=self.published, refused=self.refused, skipped=self.skipped,
-                      gaps=self.gaps, milliseconds=self.milliseconds, note=self.note)
+        counted = {name: min(getattr(self, name), MOST_COUNTED)
+                   for name in ("received", "published", "refused", "skipped", "gaps")}
+        return Status(run=run, episode=episode, step=step, seq=seq, service=self.service, state=self.state, **counted,
+                      milliseconds=self.milliseconds, note=self.note)
 
 
 class Heartbeat:
@@ -171,8 +173,18 @@ class Heartbeat:
         if self._file:
             with contextlib.suppress(OSError):  # a reader of the file sees that it grows old
                 Path(self._file).write_text(self._health.state)
-        self._bus.publish(STATUS, self._health.service, encode(self._health.status(self._seq)))
+        self._bus.publish(STATUS, self._health.service, self._encoded())
         self._seq += 1
+
+    def _encoded(self) -> bytes:
+        """The status. If something in it cannot be told, the state is told with the reason: a service that is not
+        heard is taken for one that hangs."""
+        status = self._health.status(self._seq)
+        try:
+            return encode(status)
+        except MessageError as error:
+            return encode(Status(run="", episode=0, step=0, seq=self._seq, service=status.service, state=status.state,
+                                 note=f"its status cannot be told: {error}"))
 
 
 def run_process(name: str, work: Callable[[Config, Path, Inbox], None], *, inbox: Inbox | None = None,
