@@ -23,7 +23,7 @@ from saccade.app.log.info import gather
 from saccade.app.log.recover import recover
 from saccade.app.replay.comparison import Comparison
 from saccade.shared.bus.topics import ACTION, FRAME, PERCEPT, TRUTH
-from saccade.shared.bus.wire import encode
+from saccade.shared.bus.wire import MAX_SMALL_BYTES, encode
 from saccade.shared.errors import SaccadeError
 from saccade.shared.log.reading import RunReader, is_whole
 from saccade.shared.log.recording import LONGEST_KEY, MOST_KEYS, RunLog
@@ -253,8 +253,8 @@ def test_a_log_takes_so_many_keys_and_no_strange_ones(tmp_path, monkeypatch):
     assert log.messages == MOST_KEYS
     assert f"{MOST_KEYS} keys at most" in log.refusal(PERCEPT, "other", payload)
     assert log.refusal(PERCEPT, "0", payload) is None
-    monkeypatch.setattr("saccade.shared.log.recording.MAX_PAYLOAD_BYTES", 10)
-    assert "messages of at most 10 bytes" in log.refusal(PERCEPT, "0", payload)
+    assert "messages of percept of at most 1048576 bytes" in log.refusal(PERCEPT, "0", bytes(MAX_SMALL_BYTES + 1))
+    assert log.refusal(FRAME, None, bytes(MAX_SMALL_BYTES + 1)) is not None  # there is no room for another key
     assert [entry.part for entry in RunReader(log.path).entries()] == [str(i) for i in range(MOST_KEYS)]
 
 

@@ -43,7 +43,8 @@ class Missing:
     nobody keeps a copy of them, so they do not make a log incomplete. `absent`: stretches of steps without a topic that
     every step should have, the first MOST_ABSENT of them. `repeated`: messages that are there twice. `refused`: entries
     that are not valid messages. `unfinished`: how far the run came, if it was not finished. `episodes`: stretches of
-    whole episodes that are missing. `cut`: why the file is not whole.
+    whole episodes that are missing. `beyond`: stretches of episodes that the run did not have. `cut`: why the file is
+    not whole.
     """
 
     messages: int = 0
@@ -52,6 +53,7 @@ class Missing:
     lost: dict[str, int] = field(default_factory=dict)
     absent: list[Absent] = field(default_factory=list)
     episodes: list[tuple[int, int]] = field(default_factory=list)
+    beyond: list[tuple[int, int]] = field(default_factory=list)
     refused: int = 0
     unfinished: str | None = None
     cut: str | None = None
@@ -65,7 +67,7 @@ class Missing:
     def complete(self) -> bool:
         """Whether the log holds messages, and nothing is missing."""
         return self.messages > 0 and not (self.lost or self.absent or self.repeated or self.refused or self.episodes
-                                          or self.unfinished or self.cut)
+                                          or self.beyond or self.unfinished or self.cut)
 
     def lines(self) -> Iterator[str]:
         """Yields one line for each thing that is missing."""
@@ -80,6 +82,8 @@ class Missing:
             yield "holds no message"
         if self.episodes:
             yield f"episodes that are not there: {in_stretches(self.episodes)}"
+        if self.beyond:
+            yield f"messages of episodes that the run did not have: {in_stretches(self.beyond)}"
         for key, count in sorted(self.lost.items()):
             yield f"{key}: {count} messages lost, by their sequence numbers"
         for (run, episode, key), group in itertools.groupby(sorted(self.absent), lambda at: at[:3]):
@@ -117,7 +121,7 @@ def missing(path: Path) -> Missing:
     if sequences is not None:
         report.lost = {TOPICS[name].key(reader.world, part): lost for (name, part), lost in sequences.missing.items()}
     if kept is None and AWAITED in reader.metadata:
-        report.unfinished, report.episodes = _unfinished(reader, there)
+        report.unfinished, report.episodes, report.beyond = _unfinished(reader, there)
     report.refused, report.cut = reader.refused, reader.cut
     return report
 
@@ -163,18 +167,20 @@ class There:
                     yield Absent(*episode, key, 0, 0)
 
 
-def _unfinished(reader: RunReader, there: There) -> tuple[str | None, list[tuple[int, int]]]:
+def _unfinished(reader: RunReader, there: There) -> tuple[str | None, list[tuple[int, int]], list[tuple[int, int]]]:
     """Returns how far the run came if it was not finished. If it was finished, returns which whole episodes are
-    missing."""
+    missing, and which are there although the run did not have them."""
     found = {episode for _, episode in there.steps}
     if FINISHED not in reader.metadata:
         last = max(found, default=None)
         how_far = "before its first step" if last is None else f"in episode {last}"
         return (f"the run was not finished: it was ended {how_far}, and its source did not say that this was the last "
-                "step; start a new run for the rest"), []
+                "step; start a new run for the rest"), [], []
     told = reader.metadata[FINISHED].get("episodes", "")
     count = int(told) if told.isascii() and told.isdigit() and len(told) < 20 else 0
-    return None, list(itertools.islice(between(found, 0, count - 1), MOST_ABSENT))
+    beyond = sorted(episode for episode in found | {episode for _, episode in there.held} if episode >= count)
+    return (None, list(itertools.islice(between(found, 0, count - 1), MOST_ABSENT)),
+            [(episode, episode) for episode in beyond[:MOST_ABSENT]])
 
 
 def between(numbers: set[int], first: int, last: int) -> Iterator[tuple[int, int]]:

@@ -17,7 +17,7 @@ from saccade.app.log.source import whole
 from saccade.shared.bus.topics import parse_key
 from saccade.shared.errors import SaccadeError, printable
 from saccade.shared.files import opened
-from saccade.shared.log.foreign import NAME_LIMIT, describe, foreign, is_key
+from saccade.shared.log.foreign import NAME_LIMIT, describe, foreign, is_ours
 from saccade.shared.log.reading import ANY_SIZE, MOST_NOTES, NEED
 from saccade.shared.log.recording import ENDED_EARLY, KEY, LOG, RECOVERED, channel_of, json_schema, key_metadata
 
@@ -137,7 +137,7 @@ class Copy:
             self._report.nameless += 1
             return
         self._report.messages += 1
-        self._report.ours |= is_key(channel.topic)
+        self._report.ours |= is_ours(channel)
         self._writer.add_message(self._channel(channel), message.log_time, message.data, message.publish_time,
                                  message.sequence)
 
@@ -148,11 +148,11 @@ class Copy:
             return known[2]
         about = repr((channel, schema))
         if about not in self._ids:
-            if schema is None and is_key(channel.topic):
+            if schema is None and is_ours(channel):
                 schema = _schema_of(channel.topic)
             new = self._ids[about] = self._writer.register_channel(
                 channel.topic, channel.message_encoding, self._schema(schema), channel.metadata)
-            if is_key(channel.topic):
+            if is_ours(channel):
                 self._writer.add_metadata(KEY, key_metadata(new, channel.topic))
         self._known[channel.id] = channel, self._schemas.get(channel.schema_id), self._ids[about]
         return self._ids[about]

@@ -6,35 +6,33 @@ A long queue in front of the log takes the messages that arrive while it writes.
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import itertools
-import platform
 import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
-from importlib import metadata
 from pathlib import Path
 
 from saccade.shared.bus.messages import Message, Status
 from saccade.shared.bus.outbox import KEPT_BYTES
 from saccade.shared.bus.sequences import Key, Sequences
-from saccade.shared.bus.topics import RESULT, STATUS, TOPICS, Topic
+from saccade.shared.bus.topics import RESULT, TOPICS, Topic
 from saccade.shared.bus.transport import Bus, LocalBus, ZenohBus
 from saccade.shared.bus.wire import MessageError, decode
 from saccade.shared.config import Config
 from saccade.shared.errors import NAME_LIMIT, SaccadeError, printable, told
 from saccade.shared.log.folder import LOG_NAME
-from saccade.shared.log.provenance import commit
+from saccade.shared.log.provenance import describe
 from saccade.shared.log.reading import RunReader
-from saccade.shared.log.recording import AWAITED, CUT, FINISHED, FLUSH_S, RecordingStopped, RunLog
+from saccade.shared.log.recording import AWAITED, FINISHED, FLUSH_S, RecordingStopped, RunLog
+from saccade.shared.loop.episodes import stranger
 from saccade.shared.loop.process import Health, Heartbeat, Inbox, Item, run_process
 
 NAME = "recorder"
 QUEUE_BYTES = 512 * 1024 * 1024
 ASKED_AGAIN_S = 0.5  # time until missing messages are asked for again; it doubles with every attempt
+MOST_INVALID_BYTES = 64 * 1024 * 1024  # of payloads that are not valid messages and are recorded all the same
 QUIET_S = 1.5  # after this time without a new message the publishers are asked for their latest ones
-PACKAGES = ("saccade", "eclipse-zenoh", "mcap", "msgpack", "numpy", "mujoco", "torch")
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -74,7 +72,10 @@ class Recorder:
         self._last: dict[Key, tuple[int, int]] = {}  # newest (episode, step) of each key
         self._names = config.scene.names or ()
         self._left_out: set[str] = set()  # reasons for which the log did not take messages, each told once
-        self._finished = False
+        self._finished, self._invalid_bytes = False, 0
+        self._sources = ("simulator", "camera") if config.bus.live else ("simulator",)
+        self._follows_source = bool(config.bus.wait_for)  # what a replay plays may begin and go on anywhere
+        self._episode = 0  # the episode that the source is in
         self._asked_s, self._ask_again_s, self._news_s = 0.0, ASKED_AGAIN_S, time.monotonic()
         self.log = self._open(folder / LOG_NAME, config)
 
@@ -149,13 +150,14 @@ class Recorder:
     def _take(self, topic: Topic, part: str | None, payload: bytes) -> None:
         self.health.received += 1
         message = self._checked(topic, part, payload)
-        if message is not None and message.run == self._run and self._sequences.begins(topic, part, message):
+        is_own = message is not None and message.run == self._run and self._ahead(topic, message) is None
+        if is_own and message is not None and self._sequences.begins(topic, part, message):
             # A new episode begins. The last messages of the episode before may be lost, so they are asked for.
             self._write_kept([topic], self._last.get((topic.name, part), (message.episode, 0)))
         self._write(self.log, topic, part, payload, message)
         self.health.published = self.log.messages
         self._ask_for_missing()
-        if topic == RESULT and message is not None and message.run == self._run:
+        if topic == RESULT and is_own and message is not None:
             self._ask_for_held(message.episode)
 
     def _ask_for_news(self) -> None:
@@ -206,18 +208,21 @@ class Recorder:
 
     def _write(self, log: RunLog, topic: Topic, part: str | None, payload: bytes, message: Message | None,
                time_ns: int | None = None) -> None:
-        """Writes a message once. One of another run is refused, and so is one that the log does not take."""
+        """Writes a message once. One that cannot be of this run is refused, and so is one that the log does not
+        take."""
         if (reason := log.refusal(topic, part, payload)) is not None:
             self._leave_out(topic, part, reason)
             return
-        if message is not None:
-            # A service has no run before its first episode, but it has a status.
-            if message.run != self._run and (topic != STATUS or message.run):
-                self.health.refuse(topic, part, f"run: it is of the run {told(message.run)}, not of "
-                                                f"{told(self._run)}, and is not recorded")
+        if message is None:
+            self._invalid_bytes += len(payload)
+            if self._invalid_bytes > MOST_INVALID_BYTES:
+                self._leave_out(topic, part, f"a log takes {MOST_INVALID_BYTES} bytes of messages that are not valid")
                 return
-            if isinstance(message, Status) and message.state == "finished" and message.run:
-                self._finish(log, message.episode + 1)
+        else:
+            if (reason := self._strange(topic, part, message)) is not None:
+                self.health.refuse(topic, part and printable(part, NAME_LIMIT), f"{reason}, and is not recorded")
+                return
+            self._follow(log, topic, part, message)
             if (lost := self._sequences.take(topic, part, message)) is None:
                 return
             if lost and time_ns is None:  # the missing ones come first, so that the log is in order
@@ -227,6 +232,32 @@ class Recorder:
                 self._last[key] = max(self._last.get(key, (0, 0)), (message.episode, message.step))
         log.write(topic, part, payload, sequence=message.seq if message else 0, log_time_ns=time_ns)
 
+    def _strange(self, topic: Topic, part: str | None, message: Message) -> str | None:
+        """Says why a message cannot be of this run. Returns None if it may be."""
+        if isinstance(message, Status):
+            return stranger(message, part, self._run)
+        if message.run != self._run:
+            return f"it is of the run {told(message.run)}, not of {told(self._run)}"
+        return self._ahead(topic, message)
+
+    def _ahead(self, topic: Topic, message: Message) -> str | None:
+        """Says why a message cannot be there yet: the next episode has not begun when its result comes, or the one
+        after it. Returns None if the message may be there."""
+        last = self._episode + (topic != RESULT)
+        if not self._follows_source or not topic.in_step or message.episode <= last:
+            return None
+        return f"it is of episode {message.episode}, while episode {self._episode} goes on"
+
+    def _follow(self, log: RunLog, topic: Topic, part: str | None, message: Message) -> None:
+        """Notes which episode the source is in, and that it has finished. While the recorder was away, several episodes
+        may have gone by: the source says which one it is in."""
+        if isinstance(message, Status):
+            if part in self._sources and message.run:
+                self._episode = max(self._episode, message.episode)
+                if message.state == "finished" and message.episode == self._episode:
+                    self._finish(log, message.episode + 1)
+        elif topic != RESULT and message.episode == self._episode + 1:
+            self._episode += 1
 
     def _leave_out(self, topic: Topic, part: str | None, reason: str) -> None:
         """Counts a message that the log does not take, and names the first for each reason."""
@@ -253,21 +284,3 @@ def complete(folder: Path, config: Config) -> None:
 def to_be_finished() -> dict[str, dict[str, str]]:
     """Metadata of the log of a run whose source says when it is over. `saccade log check` then asks whether it did."""
     return {AWAITED: {FINISHED: "when the source has finished its last episode"}}
-
-
-def describe(config: Config, run: str) -> dict[str, dict[str, str]]:
-    """The origin of the log: run, seed, commit, hash of the configuration, versions, hashes of the weights."""
-    text = config.model_dump_json()
-    cut = {CUT: {"start": str(config.bus.first_step)}} if config.bus.first_step else {}
-    return {**cut, "run": {"run": run, "seed": str(config.seed), "commit": commit(),
-                    "configuration_sha256": hashlib.sha256(text.encode()).hexdigest()},
-            "versions": {"python": platform.python_version(), **{name: _version(name) for name in PACKAGES}},
-            "weights_sha256": {str(p.relative_to(config.weights)): hashlib.sha256(p.read_bytes()).hexdigest()
-                               for p in sorted(config.weights.glob("**/*.safetensors"))}}
-
-
-def _version(package: str) -> str:
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return "absent"

@@ -30,7 +30,7 @@ MAX_FIELDS = 64
 MAX_NAME = 64  # bytes of a field's name
 MAX_REASON = 200  # characters
 HEADER_BYTES = 128  # the header of an array is always shorter than this
-STAMP_BYTES = 512  # the stamp with which a message begins is always shorter than this
+STAMP_BYTES = MAX_TEXT + 512  # the stamp with which a message begins is always shorter than this
 
 
 class MessageError(ValueError):
@@ -175,9 +175,14 @@ def _check_text(name: str, text: str) -> None:
 
 
 def _check_size(message_type: type[Message], payload: bytes) -> None:
-    limit = MAX_BYTES if _holds_image(message_type) else MAX_SMALL_BYTES
+    limit = limit_of(message_type)
     if len(payload) > limit:
         raise MessageError(f"{len(payload)} bytes, more than {limit}")
+
+
+def limit_of(message_type: type[Message]) -> int:
+    """The largest size of a message of this type, in bytes: one with an image may be larger."""
+    return MAX_BYTES if _holds_image(message_type) else MAX_SMALL_BYTES
 
 
 @functools.cache
@@ -256,7 +261,9 @@ def _check_array(name: str, value: Any, spec: ArraySpec, dimensions: dict[str, i
         raise MessageError(f"{name}: not an array of {spec.dtype}")
     shape = [dimensions.setdefault(d, n) if isinstance(d, str) else d
              for d, n in zip(spec.shape, value.shape, strict=False)]
-    if len(spec.shape) != value.ndim or list(value.shape) != shape or max(value.shape, default=0) > MAX_SIDE:
+    if max(value.shape, default=0) > MAX_SIDE:
+        raise MessageError(f"{name}: shape {list(value.shape)}, with a side of more than {MAX_SIDE}")
+    if len(spec.shape) != value.ndim or list(value.shape) != shape:
         raise MessageError(f"{name}: shape {list(value.shape)}, not {list(spec.shape)}")
     if value.dtype.kind == "f" and not np.isfinite(value).all():
         raise MessageError(f"{name}: not finite")

@@ -11,7 +11,7 @@ from mcap.records import Attachment, Channel, Header, Metadata
 
 from saccade.shared.bus.topics import parse_key
 from saccade.shared.errors import SaccadeError, printable
-from saccade.shared.log.recording import AWAITED, CONFIGURATION, KEY, LOG
+from saccade.shared.log.recording import AWAITED, CONFIGURATION, ENCODING, KEY, LOG
 from saccade.shared.log.records import DAMAGE, records, summary_of, within
 
 NAMED = 2  # so many topics are named one by one
@@ -26,6 +26,11 @@ def is_key(topic: str) -> bool:
     except SaccadeError:
         return False
     return topic.isprintable()
+
+
+def is_ours(channel: Channel) -> bool:
+    """Whether a channel holds messages of Saccade's."""
+    return channel.message_encoding == ENCODING and is_key(channel.topic)
 
 
 def foreign(path: Path) -> str | None:
@@ -96,7 +101,7 @@ class _Found:
 
 def _is_ours(record: object) -> bool:
     if isinstance(record, Channel):
-        return is_key(record.topic)
+        return is_ours(record)
     if isinstance(record, Metadata):
         return record.name in (LOG, AWAITED, KEY)
     return isinstance(record, Attachment) and record.name == CONFIGURATION

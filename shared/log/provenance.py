@@ -1,14 +1,37 @@
-"""The state of the source with which something was made."""
+"""Where a log comes from: the state of the source, the versions, the configuration and the weights."""
 
 from __future__ import annotations
 
+import hashlib
 import os
+import platform
 import subprocess
+from importlib import metadata
 
-from saccade.shared.config import PACKAGE
+from saccade.shared.config import PACKAGE, Config
+from saccade.shared.log.recording import CUT
 
 WRITTEN = ("results", "docs")
 BUILT_FROM = PACKAGE / "COMMIT"  # this file is in a wheel
+PACKAGES = ("saccade", "eclipse-zenoh", "mcap", "msgpack", "numpy", "mujoco", "torch")
+
+
+def describe(config: Config, run: str) -> dict[str, dict[str, str]]:
+    """The origin of the log: run, seed, commit, hash of the configuration, versions, hashes of the weights."""
+    text = config.model_dump_json()
+    cut = {CUT: {"start": str(config.bus.first_step)}} if config.bus.first_step else {}
+    return {**cut, "run": {"run": run, "seed": str(config.seed), "commit": commit(),
+                    "configuration_sha256": hashlib.sha256(text.encode()).hexdigest()},
+            "versions": {"python": platform.python_version(), **{name: _version(name) for name in PACKAGES}},
+            "weights_sha256": {str(p.relative_to(config.weights)): hashlib.sha256(p.read_bytes()).hexdigest()
+                               for p in sorted(config.weights.glob("**/*.safetensors"))}}
+
+
+def _version(package: str) -> str:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return "absent"
 
 
 def commit() -> str:

@@ -15,7 +15,7 @@ from saccade.shared.bus.topics import Topic, parse_key
 from saccade.shared.bus.wire import MessageError, decode
 from saccade.shared.errors import SaccadeError, printable
 from saccade.shared.files import opened
-from saccade.shared.log.foreign import foreign, is_key
+from saccade.shared.log.foreign import foreign, is_ours
 from saccade.shared.log.migrations import OLDEST, Migration
 from saccade.shared.log.recording import CONFIGURATION, ENDED_EARLY, KEY, LOG
 from saccade.shared.log.records import DAMAGE, records, summary_of
@@ -83,7 +83,7 @@ class RunReader:
                         yield Recorded(topic, part, migrate(topic, part, record.data), record.log_time)
                     elif isinstance(record, Channel):
                         channels.pop(record.id, None)
-                        if is_key(record.topic):  # other channels were added by somebody else
+                        if is_ours(record):  # other channels were added by somebody else
                             self.world, topic, part = parse_key(record.topic)
                             channels[record.id] = topic, part
                     else:

@@ -19,10 +19,9 @@ from mcap.writer import MCAP0_MAGIC, Writer
 
 from saccade.shared.bus.messages import ArraySpec, Message, field_types
 from saccade.shared.bus.topics import Topic, parse_key
-from saccade.shared.bus.wire import ARRAY_EXTENSION
+from saccade.shared.bus.wire import ARRAY_EXTENSION, limit_of
 from saccade.shared.errors import SaccadeError
 from saccade.shared.log.migrations import FORMAT
-from saccade.shared.log.records import MAX_PAYLOAD_BYTES
 
 FLUSH_S = 0.4  # a chunk is closed this often; a recorder that is killed loses at most this much
 CONFIGURATION = "config.json"
@@ -32,6 +31,7 @@ CUT = "cut"  # metadata of a log that begins later than step 0, or is a part of 
 AWAITED = "awaited"  # metadata of a run's log that must hold FINISHED at its end
 FINISHED = "finished"  # metadata of a run's log whose source has said that it is over: its number of episodes
 RECOVERED = "recovered"  # metadata of a recovered log: from which, and what was lost
+ENCODING = "msgpack"  # of the messages, as a channel says it
 KEY = "key"  # metadata, one for each key: repeats its channel outside of the chunks, in case its chunk is damaged
 MOST_KEYS = 4096  # in one log; MCAP has numbers for 65,535
 LONGEST_KEY = 256
@@ -82,8 +82,9 @@ class RunLog:
                 return f"a log takes {MOST_KEYS} keys at most"
             if len(key) > LONGEST_KEY or not key.isprintable():
                 return f"a log takes keys of at most {LONGEST_KEY} printable characters"
-        if len(payload) > MAX_PAYLOAD_BYTES:
-            return f"a log takes messages of at most {MAX_PAYLOAD_BYTES} bytes"
+        limit = limit_of(topic.type)
+        if len(payload) > limit:
+            return f"a log takes messages of {topic.name} of at most {limit} bytes"
         return None
 
     def note(self, name: str, values: Mapping[str, object]) -> None:
@@ -148,7 +149,7 @@ class RunLog:
             if name not in self._schemas:
                 text = json.dumps(json_schema(topic.type), sort_keys=True).encode()
                 self._schemas[name] = writer.register_schema(name, "jsonschema", text)
-            channel = self._channels[key] = writer.register_channel(key, "msgpack", self._schemas[name])
+            channel = self._channels[key] = writer.register_channel(key, ENCODING, self._schemas[name])
             writer.add_metadata(KEY, key_metadata(channel, key))
         log_time_ns = min(max(log_time_ns, 0), 2 ** 63 - 1)
         writer.add_message(self._channels[key], log_time_ns, payload, log_time_ns, sequence % 2 ** 32)
@@ -220,7 +221,7 @@ def channel_of(values: Mapping[str, str]) -> Channel | None:
         parse_key(key)
     except SaccadeError:
         return None
-    return Channel(id=int(channel), topic=key, message_encoding="msgpack", metadata={}, schema_id=0)
+    return Channel(id=int(channel), topic=key, message_encoding=ENCODING, metadata={}, schema_id=0)
 
 
 def json_schema(message_type: type[Message]) -> dict[str, Any]:

@@ -22,12 +22,11 @@ from mcap.writer import MCAP0_MAGIC
 
 from saccade.shared.bus.wire import MAX_BYTES
 
-MAX_PAYLOAD_BYTES = 2 * MAX_BYTES  # largest payload that a log takes; valid messages are smaller
 MAX_CHUNK_BYTES = 4 * MAX_BYTES  # largest size of a chunk after it is decompressed
 MAX_RECORD_BYTES = 256 * 1024 * 1024
 MAX_ATTACHMENT_BYTES = 64 * 1024 * 1024
 MAX_NOTE_BYTES = 1024 * 1024  # largest record that becomes many small objects, such as metadata and channels
-# All chunks together may hold MOST_OPENED_BYTES, or MOST_TIMES their compressed size if that is more.
+# A chunk may hold MOST_TIMES its compressed size. Those that hold more may hold MOST_OPENED_BYTES together.
 MOST_OPENED_BYTES, MOST_TIMES = 1024 ** 3, 500
 
 HEAD = struct.Struct("<BQ")  # head of every record: opcode and length
@@ -73,13 +72,16 @@ class Opener:
     """Opens the chunks of one file. It stops if they become larger than a log can be."""
 
     def __init__(self, *, sums: bool) -> None:
-        self._sums, self._taken, self._opened = sums, 0, 0
+        self._sums, self._swollen = sums, 0
 
     def data(self, chunk: mcap.Chunk) -> bytes:
         """Returns the data of a chunk. Raises one of DAMAGE if the chunk is not whole, or too large."""
         size = chunk.uncompressed_size
-        self._taken, self._opened = self._taken + len(chunk.data), self._opened + size
-        if size > MAX_CHUNK_BYTES or self._opened > max(MOST_OPENED_BYTES, MOST_TIMES * self._taken):
+        if size > MAX_CHUNK_BYTES:
+            raise ValueError(f"a chunk would open to {size} bytes")
+        swollen = size if size > MOST_TIMES * len(chunk.data) else 0
+        self._swollen += swollen
+        if swollen and self._swollen > MOST_OPENED_BYTES:
             raise ValueError(f"a chunk would open to {size} bytes")
         data = _decompressed(chunk, size)
         if len(data) != size:
