@@ -29,7 +29,7 @@ class Head:
     @property
     def query(self) -> dict[str, str]:
         """The last value of each name in the target's query."""
-        return {name: values[-1] for name, values in parse_qs(urlsplit(self.target).query).items()}
+        return {name: values[-1] for name, values in parse_qs(self.target.partition("?")[2]).items()}
 
     @property
     def host(self) -> str | None:
@@ -47,7 +47,7 @@ class Head:
     def host_and_port(self) -> str:
         """The Host header of a request that is not refused, always with a port."""
         header = self.headers["host"]
-        return header if urlsplit(f"//{header}").port else f"{header}:80"
+        return header if urlsplit(f"//{header}").port else f"{header.removesuffix(':')}:80"
 
 
 def head_of(data: bytes) -> Head | None:

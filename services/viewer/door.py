@@ -21,10 +21,13 @@ from saccade.shared.errors import SaccadeError
 Address = tuple[str, int]
 Guest = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
 
-MOST = 64  # connections at the same time; more are refused
+MOST = 64  # connections that were let in, at the same time; more are refused
+MOST_WAITING = 64  # connections of which nobody knows yet who it is; the oldest makes room for a new one
+LENGTH_DIGITS = 18  # of a body's length
 BYTES = 64 * 1024  # the longest head, and what a direction of a connection holds in memory, about
 HEAD_S = 10.0  # how long to wait for a head
 ANSWER_S = 20.0  # how long to wait for Rerun's server to be connected
+FULL = "too many connections: close other pages of this viewer"
 END = b"\r\n\r\n"
 HTTP2 = b"PRI * HTTP/2.0\r\n\r\n"  # how a connection of HTTP/2 without TLS begins
 REPLACED = ("connection", "content-security-policy", "access-control-")  # headers of the page that are ours to set
@@ -48,7 +51,8 @@ class Door:
         except SaccadeError:
             self.close()
             raise
-        self._met = 0
+        self._waiting: dict[asyncio.StreamWriter, None] = {}  # in the order in which they came
+        self._let_in: set[asyncio.StreamWriter] = set()
         self._loop = asyncio.new_event_loop()
         self._stop = asyncio.Event()
         self._thread = threading.Thread(target=self._run, name="door", daemon=True)
@@ -78,38 +82,56 @@ class Door:
 
     def _guest(self, *, has_page: bool) -> Guest:
         async def meet(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-            self._met += 1
-            with contextlib.suppress(OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError, TimeoutError):
-                if self._met > MOST:
-                    await _answer(writer, 503, "too many connections: close other pages of this viewer")
-                else:
+            self._waiting[writer] = None
+            if len(self._waiting) > MOST_WAITING:
+                oldest = next(iter(self._waiting))
+                del self._waiting[oldest]
+                oldest.close()
+            try:
+                with contextlib.suppress(OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError, TimeoutError):
                     await self._meet(reader, writer, has_page=has_page)
-            self._met -= 1
-            writer.close()
+            finally:
+                self._waiting.pop(writer, None)
+                self._let_in.discard(writer)
+                writer.close()
 
         return meet
 
     async def _meet(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, *, has_page: bool) -> None:
         data = await asyncio.wait_for(reader.readuntil(END), HEAD_S)
         if data == HTTP2:
-            if self._rules.admits_native(str(writer.get_extra_info("peername")[0])):
+            if self._rules.admits_native(str(writer.get_extra_info("peername")[0])) and self._enter(writer):
                 await self._forward(self._data, data, reader, writer)
             else:
                 await _answer(writer, 403, "only a browser gets in from another host: for a Rerun viewer use ssh -L")
             return
-        head = head_of(data)
+        try:
+            head = head_of(data)
+            refusal = head and self._rules.refusal(head)
+        except ValueError:  # an address that cannot be taken apart
+            head = refusal = None
         if head is None:
             await _answer(writer, 400, "this is no request of a browser")
-        elif refusal := self._rules.refusal(head):
+        elif refusal:
             await _answer(writer, 403, refusal)
-        elif "transfer-encoding" in head.headers or not head.headers.get("content-length", "0").isdecimal():
+        elif "transfer-encoding" in head.headers or (length := _length(head)) is None:
             await _answer(writer, 411, "a request needs a length")
+        elif not self._enter(writer):
+            await _answer(writer, 503, FULL)
         elif has_page and head.method in ("GET", "HEAD"):
             await self._show(head, reader, writer)
         elif has_page and head.method != "POST":
             await _answer(writer, 405, "the viewer only shows")
         else:
-            await self._forward(self._data, _alone(head), reader, writer, int(head.headers.get("content-length", 0)))
+            await self._forward(self._data, _alone(head), reader, writer, length)
+
+    def _enter(self, writer: asyncio.StreamWriter) -> bool:
+        """Counts a connection among those that were let in. Returns False if there are too many."""
+        if len(self._let_in) >= MOST:
+            return False
+        self._waiting.pop(writer, None)
+        self._let_in.add(writer)
+        return True
 
     async def _show(self, head: Head, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """A file of the page; the bare address leads to the recording, and takes the token out of sight."""
@@ -170,6 +192,12 @@ async def _answer(writer: asyncio.StreamWriter, status: int, text: str, headers:
     writer.write(f"HTTP/1.1 {status} {REASONS[status]}\r\n{headers}Content-Type: text/plain; charset=utf-8\r\n"
                  f"Content-Length: {len(body)}\r\nConnection: close\r\n\r\n".encode() + body)
     await writer.drain()
+
+
+def _length(head: Head) -> int | None:
+    """The length of a request's body. None if it is not told in digits."""
+    told = head.headers.get("content-length", "0")
+    return int(told) if told.isascii() and told.isdigit() and len(told) <= LENGTH_DIGITS else None
 
 
 def _alone(head: Head) -> bytes:
