@@ -139,7 +139,7 @@ class BeliefConfig(Section):
 
     particles: int = Field(10_000, ge=100, le=1_000_000)
     """Particles per object."""
-    jitter_m: float = Field(0.002, gt=0)
+    jitter_m: float = Field(0.002, gt=0, le=1)
     """Standard deviation of the noise that is added to resampled particles."""
     present_above: float = Field(0.6, ge=0, le=1)
     """An object counts as seen in an image if its presence is above this."""
@@ -156,13 +156,13 @@ class BeliefConfig(Section):
     """Particles are resampled when their effective share falls below this."""
     missed_weight: float = Field(0.3, gt=0, le=1)
     """Factor by which a particle loses weight when its object should have been seen and was not."""
-    published_particles: int = Field(512, ge=16, le=MANY)
+    published_particles: int = Field(512, ge=16, le=8192)
     """How many particles a belief message carries."""
     keyframes: int = Field(24, ge=1, le=MANY)
     """How many views of an object are kept for its pose."""
     view_worth: float = Field(0.5, gt=0, le=1)
     """How much one view counts for the pose."""
-    views_worth: float = Field(2.5, gt=0)
+    views_worth: float = Field(2.5, gt=0, le=MANY)
     """How much all views together count at most: they share the error of the goal's own percept."""
 
 
@@ -175,7 +175,7 @@ class PlannerConfig(Section):
     """A new viewpoint is chosen after this many steps, or on arrival."""
     step_m: float = Field(0.05, gt=0, le=0.5)
     """How far the camera moves in one step."""
-    range_std_m: float = Field(0.025, gt=0)
+    range_std_m: float = Field(0.025, gt=0, le=10)
     """Standard deviation of the preferred range around the goal's range."""
     goal_confidence: float = Field(0.7, ge=0, le=1)
     """If no object is recognised in the goal image with at least this probability, the agent explores."""
@@ -183,7 +183,7 @@ class PlannerConfig(Section):
     """Bring the target to the pixel where the goal image shows it, instead of to the centre."""
     retry: bool = True
     """When a viewpoint turns out not to show the goal's view, leave it for another one."""
-    information_weight: float = Field(1.0, ge=0)
+    information_weight: float = Field(1.0, ge=0, le=MANY)
     """Weight of the expected information gain."""
 
 

@@ -25,6 +25,7 @@ from saccade.shared.bus.topics import FRAME, TOPICS, Topic
 from saccade.shared.config import weights_folder
 from saccade.shared.errors import SaccadeError
 from saccade.shared.log.folder import LOG_NAME
+from saccade.shared.log.reading import RunReader
 
 TOLD = 10  # at most so many differences are printed
 PICTURE_NAME, TABLE_NAME = "moved.png", "moved.txt"
@@ -120,12 +121,23 @@ def _pass(replays: Sequence[Replay], bus: str, folder: Path, swapped: bool, cons
             results = list(pool.map(one, replays, folders))
     else:
         results = [one(replay, place) for replay, place in zip(replays, folders, strict=True)]
-    for replay, place, (outcome, moved) in zip(replays, folders, results, strict=True):
+    cuts = [_cut(replay.log) for replay in replays]
+    for replay, place, (outcome, moved), cut in zip(replays, folders, results, cuts, strict=True):
         tell(replay, outcome, console)
         if swapped:
             _tell_moved(moved, place, console)
+        if cut is not None:
+            say(console, f"  {cut}; nothing behind it was compared: `saccade log recover` makes a log of what is left")
         say(console, f"the replay's log is in {place}")
-    return all(outcome.comparison.equal for outcome, _ in results)
+    return all(outcome.comparison.equal for outcome, _ in results) and not any(cuts)
+
+
+def _cut(log: Path) -> str | None:
+    """Why a log is not whole. None if it is, as one is that was cut or recovered by Saccade."""
+    reader = RunReader(log)
+    for _ in reader.entries():
+        pass
+    return reader.cut
 
 
 def tell(replay: Replay, outcome: Outcome, console: Console) -> None:

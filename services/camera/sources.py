@@ -17,9 +17,10 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from saccade.shared.errors import SaccadeError
+from saccade.shared.errors import NAME_LIMIT, SaccadeError, printable
 from saccade.shared.world.images import MAX_PIXELS, Size, image_size, read_image
 
+WEBCAM_DIGITS = 4
 MAX_IMAGES, MAX_ENTRIES = 100_000, 1_000_000  # of a folder
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 DEFAULT_RATE_HZ = 10.0
@@ -76,8 +77,12 @@ def open_source(text: str, *, rate_hz: float = DEFAULT_RATE_HZ) -> Source:
 
 
 def webcam_number(text: str) -> int | None:
-    """The number of a webcam: 0 for `webcam:0` and for `/dev/video0`. None for any other text."""
+    """The number of a webcam: 0 for `webcam:0` and for `/dev/video0`. None for any other text. Raises SaccadeError if
+    no webcam can have the number."""
     match = re.fullmatch(r"(?:webcam:|/dev/video)([0-9]+)", text)
+    if match and len(match[1]) > WEBCAM_DIGITS:
+        raise SaccadeError(f"camera source {printable(text, NAME_LIMIT)}: give a number of at most {WEBCAM_DIGITS} "
+                           "digits, such as webcam:0")
     return int(match[1]) if match else None
 
 
@@ -274,7 +279,10 @@ def _cv2() -> Any:
 
 def _capture(what: str | int) -> Any:
     cv2 = _cv2()
-    return cv2.VideoCapture(what, cv2.CAP_FFMPEG if isinstance(what, str) else cv2.CAP_ANY)
+    try:
+        return cv2.VideoCapture(what, cv2.CAP_FFMPEG if isinstance(what, str) else cv2.CAP_ANY)
+    except cv2.error as error:
+        raise SaccadeError(f"camera source {what} cannot be opened ({error}): give another one") from error
 
 
 def _rgb(bgr: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -20,6 +20,7 @@ from saccade.shared.world.images import opened_image
 MAX_FILE_BYTES = 64 * MIB
 MAX_COUNT = 1_000_000  # of faces, of vertices and of texture coordinates: a scan has some ten thousand
 MAX_COORDINATE = 1e4
+FLAT = 1e-6  # a mesh whose vertices are so close to one plane, relative to its size, has no volume
 
 TEXTURE_MAX_PX = 2048  # with a larger texture a texel would be far smaller than a pixel, even in the nearest view
 
@@ -74,7 +75,7 @@ def _parse_obj(lines: Iterable[str]) -> tuple[NDArray, NDArray, NDArray]:
             texels.extend(_exactly(2, [float(word) for word in line.split(None, 3)[1:3]]))
         elif line.startswith("f "):
             words = _exactly(3, line.split(None, 4)[1:])
-            indices.extend(int(index) for word in words for index in _exactly(2, word.split("/", 2)[:2]))
+            indices.extend(_index(text) for word in words for text in _exactly(2, word.split("/", 2)[:2]))
         if len(numbers) > 3 * MAX_COUNT or len(texels) > 2 * MAX_COUNT or len(indices) > 6 * MAX_COUNT:
             raise ValueError(f"it has more than {MAX_COUNT} vertices or faces")
     positions, coords = np.array(numbers).reshape(-1, 3), np.array(texels).reshape(-1, 2)
@@ -90,7 +91,15 @@ def _parse_obj(lines: Iterable[str]) -> tuple[NDArray, NDArray, NDArray]:
         raise ValueError(f"a coordinate is beyond {MAX_COORDINATE:g}")
     positions, coords = positions.astype(np.float32), coords.astype(np.float32)
     pairs, inverse = np.unique(corners.reshape(-1, 2), axis=0, return_inverse=True)
-    return positions[pairs[:, 0]], coords[pairs[:, 1]], inverse.reshape(-1, 3).astype(np.int32)
+    used = positions[pairs[:, 0]]
+    if np.linalg.matrix_rank(used - used.mean(0), tol=FLAT * np.ptp(used, axis=0).max() * len(used) ** 0.5) < 3:
+        raise ValueError("its vertices lie in one plane, and an object has a volume")
+    return used, coords[pairs[:, 1]], inverse.reshape(-1, 3).astype(np.int32)
+
+
+def _index(text: str) -> int:
+    """The number of a vertex. A number that no file reaches becomes one that is not there."""
+    return int(text) if len(text) <= 18 else 2 * MAX_COUNT
 
 
 def _exactly(count: int, words: list) -> list:
