@@ -121,6 +121,7 @@ class World:
         textured = self.look.table_texture is not None
         self.model.geom("table").rgba[:3] = 1.0 if textured else np.asarray(table_rgb) / 255.0
         for name, mocap in self._mocap.items():
+            self.model.geom(name).rgba[3] = float(name in poses)  # what is transparent is not drawn, which saves time
             center, turned = poses.get(name, (_OUT_OF_SIGHT, 0.0))
             self.data.mocap_pos[mocap] = center
             if isinstance(turned, np.ndarray):
