@@ -45,8 +45,9 @@ class Art:
     def rect(self, *rectangles: Rectangle) -> None:
         """Draws filled rectangles. A later one covers an earlier one."""
         for x0, y0, x1, y1, colour in rectangles:
-            corners = (x0 * self.width, y0 * self.height, x1 * self.width - 1, y1 * self.height - 1)
-            self.draw.rectangle(corners, fill=colour)
+            left, top = x0 * self.width, y0 * self.height
+            right, bottom = max(left, x1 * self.width - 1), max(top, y1 * self.height - 1)  # at least a pixel
+            self.draw.rectangle((left, top, right, bottom), fill=colour)
 
     def poly(self, points: ArrayLike, colour: Colour) -> None:
         """Draws a filled polygon with corners [N, 2]."""
