@@ -158,6 +158,8 @@ def test_a_webcam_goes_by_its_number(monkeypatch, text):
 
 
 def test_a_webcam_that_is_not_there_is_refused():
+    for number in ("9" * 20, "9" * 5000):
+        assert "give a number of at most 4 digits" in complaint(open_source, f"webcam:{number}")
     assert "webcam:99 does not open" in complaint(open_source, "webcam:99")
 
 

@@ -185,7 +185,9 @@ CONFIGURATIONS = {
     "latin.json": b'{"run": "\xff"}', "list.json": b"[]", "huge.json": b'{"seed": 1e999}',
     "twice.json": b'{"seed": 1, "seed": 2}',
     "digits.json": b'{"seed": ' + b"9" * 5000 + b"}", "hex.toml": b"seed = 0x" + b"f" * MANY,
-    "inf.toml": b"[belief]\njitter_m = inf", "red.json": b'{"run": "\\u001b[31m"}', "half.json": b'{"run": "\\ud800"}',
+    "inf.toml": b"[belief]\njitter_m = inf", "weight.toml": b"planner.information_weight = 1e308",
+    "particles.toml": b"belief.published_particles = 8193", "jitter.toml": b"belief.jitter_m = 1e308",
+    "red.json": b'{"run": "\\u001b[31m"}', "half.json": b'{"run": "\\ud800"}',
     "key.json": b'{"\\ud800\\u001b": 1}', "zero.json": b'{"scene": {"file": "a\\u0000"}}',
     "long.json": b'{"scene": {"file": "' + b"a" * MANY + b'"}}', "scenes.toml": b"scene.count = 1000000000000",
     "unknown.toml": b"x" * MANY + b" = 1"}

@@ -24,6 +24,7 @@ from saccade.shared.world.images import image_size, read_goal_image, read_image
 from saccade.tests.hostile import MANY, complaint, not_files, sparse
 
 POINTS = "v 0 0 0\nv 0 0 1\nv 0 1 0\nvt 0 0\nvt 0 1\nvt 1 0\n"
+SOLID = "v 1 0 0\n" + POINTS + "f 1/1 2/2 3/3\nf 1/1 2/2 4/3\nf 1/1 3/2 4/3\nf 2/1 3/2 4/3\n"
 MESHES = {
     "index of 2^63": POINTS + "f 1/1 2/2 9223372036854775808/3", "index of -2^63": POINTS + f"f 1/1 2/2 {-2 ** 63}/3",
     "index 0": POINTS + "f 1/1 2/2 0/3", "relative": POINTS + "f 1/1 2/2 -9/3",
@@ -31,10 +32,12 @@ MESHES = {
     "digits": POINTS + "f 1/1 2/2 " + "9" * 5000 + "/3", "nan": "v nan 0 0\n" + POINTS + "f 1/1 2/2 3/3",
     "far": "v 1e300 0 0\n" + POINTS + "f 1/1 2/2 3/3", "texel": "vt 1e30 0\n" + POINTS + "f 1/1 2/2 3/3",
     "square": POINTS + "f 1/1 2/2 3/3 1/1", "no texel": POINTS + "f 1 2 3", "word": "v a b c\n", "empty": "",
-    "short": "v 0 0\n", "points alone": POINTS}
+    "short": "v 0 0\n", "points alone": POINTS,
+    "one triangle": POINTS + "f 1/1 2/2 3/3", "one point": POINTS + "f 1/1 1/1 1/1",
+    "a plane": "v 0 1 1\n" + POINTS + "f 1/1 2/2 3/3\nf 1/1 2/2 4/3\nf 1/1 3/2 4/3"}
 
 
-def scan(folder: Path, text: str = POINTS + "f 1/1 2/2 3/3") -> Path:
+def scan(folder: Path, text: str = SOLID) -> Path:
     (folder / "textured.obj").write_text(text)
     Image.new("RGB", (8, 8)).save(folder / "texture_map.png")
     return folder
@@ -42,11 +45,13 @@ def scan(folder: Path, text: str = POINTS + "f 1/1 2/2 3/3") -> Path:
 
 @pytest.mark.parametrize("text", MESHES.values(), ids=MESHES)
 def test_a_damaged_mesh_is_refused(tmp_path, text):
-    assert "textured.obj is damaged" in complaint(read_obj, scan(tmp_path, text), "can")
+    told = complaint(read_obj, scan(tmp_path, text), "can")
+    assert "textured.obj is damaged" in told
+    assert "int too big" not in told
 
 
 def test_a_mesh_is_a_text_of_some_size(tmp_path, monkeypatch):
-    assert len(read_obj(scan(tmp_path), "can").faces) == 1
+    assert len(read_obj(scan(tmp_path), "can").faces) == 4
     monkeypatch.setattr(mesh, "MAX_COUNT", 5)
     for line in ("v 0 0 0\n", "vt 0 0\n", "f 1/1 1/1 1/1\n"):
         scan(tmp_path, POINTS + line * 6)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import resource
 import struct
 import subprocess
@@ -25,6 +26,7 @@ from saccade.app.replay.comparison import Comparison
 from saccade.shared.bus.topics import ACTION, FRAME, PERCEPT, TRUTH
 from saccade.shared.bus.wire import MAX_SMALL_BYTES, encode
 from saccade.shared.errors import SaccadeError
+from saccade.shared.log import records as log_records
 from saccade.shared.log.reading import RunReader, is_whole
 from saccade.shared.log.recording import LONGEST_KEY, MOST_KEYS, RunLog
 from saccade.shared.log.records import MAX_CHUNK_BYTES
@@ -138,6 +140,8 @@ def test_what_is_no_log_is_one_line_for_every_command(monkeypatch, capsys, tmp_p
 
 
 @pytest.mark.parametrize(("profile", "topics", "finish", "words"), [
+    ("ros2", ("saccade/table/frame",), True, "of profile 'ros2' with the topic saccade/table/frame, not"),
+    ("", ("saccade/table/frame",), False, "is an MCAP with the topic saccade/table/frame, not"),
     ("", ("/tf",), True, "is an MCAP with the topic /tf, not"), ("", ("/tf", "/x"), False, "the topics /tf, /x, not"),
     ("ros1", (), True, "is an MCAP of profile 'ros1' without any topic, not"), ("", (), True, "without any topic")])
 def test_other_files_are_told_as_what_they_are(tmp_path, profile, topics, finish, words):
@@ -230,6 +234,19 @@ def test_a_chunk_that_is_too_large_is_damage_before_it_is_opened(tmp_path, monke
     assert list(reader.entries()) == []
     assert "is cut or damaged" in reader.cut
     assert opened == []
+
+
+def test_a_chunk_that_swells_is_judged_by_itself(monkeypatch):
+    """Those that swell have a limit together; the others are opened as well behind them as before them."""
+    monkeypatch.setattr(log_records, "MOST_OPENED_BYTES", 3_000_000)
+    opener, swollen, honest = log_records.Opener(sums=True), chunk_of(bytes(1_000_000)), chunk_of(os.urandom(1000))
+    taken = []
+    for chunk in (swollen, honest) * 5:
+        try:
+            taken.append(len(opener.data(chunk)))
+        except ValueError:
+            taken.append(None)
+    assert taken == [1_000_000, 1000] * 3 + [None, 1000] * 2
 
 
 @pytest.mark.parametrize("configuration", ["[" * 100_000, "\0" * 1000, "[1]", '{"bus": 7, "scene": [1]}', "{"])

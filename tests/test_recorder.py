@@ -197,6 +197,7 @@ def test_messages_of_another_run_are_refused_and_named(tmp_path):
     """Also a result, with which an episode of this run would end, and a status; a service that has not begun has no
     run yet."""
     def said_by(run, topic, part=None, **changes):
+        changes |= {"service": part} if topic == STATUS else {}
         return topic, part, sample(topic.type, run=run, episode=0, step=0, seq=0, **changes)
 
     with closing(RecorderProcess(tmp_path / "run")) as recorder:
@@ -206,7 +207,7 @@ def test_messages_of_another_run_are_refused_and_named(tmp_path):
         for topic, part, message in (said_by("other", RESULT), said_by("other", ACTION), said_by("", ACTION),
                                      said_by("other", STATUS, "planner")):
             place = f"{topic.name}{'/planner' * bool(part)}"
-            note = f"refused: {place}: run: it is of the run '{message.run}', not of 'run'"
+            note = f"refused: {place}: it is of the run '{message.run}', not of 'run'"
             recorder.bus.publish(topic, part, encode(message))
             recorder.until(lambda note=note: note.encode() in b"".join(recorder.said))
         recorder.until(lambda: decode(STATUS.type, recorder.said[-1]).refused == 4)
@@ -238,12 +239,13 @@ def test_when_the_source_has_finished_the_log_says_so(tmp_path):
     config = Config().with_values({"run": "r", "bus.wait_for": ["planner", "recorder"]})
     recorder = Recorder(LocalBus(), tmp_path, config)
     recorder._take(ACTION, None, encode(sample(ACTION.type, run="r", episode=1, step=0, seq=0)))
+    at = {"episode": 1, "service": "simulator"}
     for state, run in (("ready", "r"), ("finished", "other"), ("finished", "")):
-        recorder._take(STATUS, "simulator", encode(sample(STATUS.type, run=run, episode=1, seq=0, state=state)))
+        recorder._take(STATUS, "simulator", encode(sample(STATUS.type, run=run, seq=0, state=state, **at)))
     recorder.log.flush()
     assert "the run was not finished: it was ended in episode 1" in missing(tmp_path / "run.mcap").unfinished
     for seq in (1, 2):
-        recorder._take(STATUS, "simulator", encode(sample(STATUS.type, run="r", episode=1, seq=seq, state="finished")))
+        recorder._take(STATUS, "simulator", encode(sample(STATUS.type, run="r", seq=seq, state="finished", **at)))
     recorder.log.flush()
     recorder.log._file.close()  # killed
     assert not is_whole(tmp_path / "run.mcap")

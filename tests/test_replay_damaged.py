@@ -12,7 +12,7 @@ from rich.console import Console
 
 from saccade.app.log.recover import recover
 from saccade.app.replay.replay import prepare, replay_here, replay_on_bus
-from saccade.app.replay.report import tell
+from saccade.app.replay.report import replay_all, tell
 from saccade.services.replayer.core import Keys, Pace
 from saccade.shared.bus.topics import ACTION, BELIEF, FRAME, GOAL, PERCEPT, PLAN
 from saccade.shared.bus.wire import decode, encode, stamp_of
@@ -144,3 +144,16 @@ def test_a_log_of_which_nothing_is_left_is_one_clear_error(tmp_path):
     (tmp_path / "bad.mcap").write_bytes(GOLDEN.read_bytes()[:100])
     with pytest.raises(SaccadeError, match="nothing to replay"):
         prepare(tmp_path / "bad.mcap", INTO, {}, pace=Pace())
+
+
+def test_a_check_says_that_the_log_is_damaged_and_fails(tmp_path, monkeypatch):
+    """What is left of it agrees, and a recovered log says by itself what it lacks."""
+    log = damaged(tmp_path / "log.mcap", cut=(PLAN, None, 2))
+    monkeypatch.setattr("saccade.app.replay.report.Keys", lambda enabled: Keys(enabled=False))
+    for path, agrees in ((tmp_path / "bad.mcap", False), (log, True)):
+        console = Console(file=io.StringIO(), width=400)
+        replays = [prepare(path, ("planner",), {}, pace=Pace())]
+        out = tmp_path / path.stem
+        assert replay_all(replays, bus="local", out=out, swapped=False, loops=1, console=console) is agrees
+        assert ("bad.mcap is cut or damaged" in console.file.getvalue()) is not agrees
+        assert ("nothing behind it was compared" in console.file.getvalue()) is not agrees

@@ -15,9 +15,9 @@ import yaml
 
 from saccade.deploy.director import main as direct
 from saccade.services.viewer.admission import Head, Rules, head_of, is_loopback
-from saccade.services.viewer.door import HTTP2, MOST
-from saccade.services.viewer.server import Server, url_of
-from saccade.shared.config import PACKAGE, Config
+from saccade.services.viewer.door import HTTP2, MOST, MOST_WAITING, Door
+from saccade.services.viewer.server import Server, free_port, url_of
+from saccade.shared.config import PACKAGE, Config, ViewerConfig
 from saccade.tests.test_viewer_server import WAIT_S, answer_at, configured, until
 
 READ = "/rerun.sdk_comms.v1alpha1.MessageProxyService/ReadMessages"
@@ -97,13 +97,44 @@ def raw(port: int, request: str) -> str:
 
 
 def test_guests_are_limited_and_leave_no_trace(server):
-    """Those who say nothing take all places; when they have gone there is room again."""
+    """Those who were let in take all places, and those who say nothing take none; when they have gone there is room
+    again."""
     port = urlsplit(server.url).port
+    welcome = f"GET / HTTP/1.1\r\nHost: localhost:{port}\r\n\r\n"
     with ExitStack() as stack:
-        for _ in range(MOST):
+        for _ in range(MOST_WAITING + 10):
             stack.enter_context(socket.create_connection(("127.0.0.1", port), timeout=WAIT_S))
-        assert until(lambda: raw(port, f"GET / HTTP/1.1\r\nHost: localhost:{port}\r\n\r\n") == "503")
-    assert until(lambda: raw(port, f"GET / HTTP/1.1\r\nHost: localhost:{port}\r\n\r\n") == "302")
+        assert raw(port, welcome) == "302"
+        for _ in range(MOST):
+            guest = stack.enter_context(socket.create_connection(("127.0.0.1", port), timeout=WAIT_S))
+            guest.sendall(f"POST /x HTTP/1.1\r\nHost: localhost:{port}\r\nContent-Length: 9\r\n\r\n".encode())
+        assert until(lambda: raw(port, welcome) == "503")
+    assert until(lambda: raw(port, welcome) == "302")
+
+
+def test_no_request_takes_a_place_for_good():
+    """With a token, as when other hosts reach the viewer; nobody is behind the door."""
+    port, data_port = free_port("127.0.0.1"), free_port("127.0.0.1")
+    nobody = ("127.0.0.1", 9)
+    door = Door(ViewerConfig(port=port, token="A" * 24), data_port, nobody, nobody)
+    door.open()
+    try:
+        host = f"Host: h:{port}\r\n"
+        for length in ("9" * 5000, "9" * 19, "\u00b2", "-1", "1_0"):
+            assert raw(port, f"POST /?token={'A' * 24} HTTP/1.1\r\n{host}Content-Length: {length}\r\n\r\n") == "411"
+        for _ in range(MOST + 1):
+            assert raw(port, f"GET //[x HTTP/1.1\r\n{host}\r\n") == "403"
+        assert raw(port, f"GET //[x?token={'A' * 24} HTTP/1.1\r\n{host}\r\n") == "502"
+        assert raw(port, f"GET /?token={'A' * 24} HTTP/1.1\r\n{host}\r\n") == "302"
+        assert until(lambda: not door._waiting and not door._let_in)
+    finally:
+        door.close()
+
+
+@pytest.mark.parametrize(("header", "told"), [("localhost:", "localhost:80"), ("localhost", "localhost:80"),
+                                              ("[::1]:", "[::1]:80"), ("localhost:9090", "localhost:9090")])
+def test_a_port_is_always_told(header, told):
+    assert Head("GET", "/", {"host": header}).host_and_port == told
 
 
 def test_opened_to_other_hosts_it_asks_for_the_token_that_its_address_has():
