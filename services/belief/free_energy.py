@@ -15,9 +15,10 @@ from saccade.shared.world.geometry import project, spherical, wrap
 
 Array = NDArray[np.float64]
 
-# Standard deviation of a crop's colours around their reconstruction: the paper's likelihood is the squared error.
-PIXEL_STD = 1.0
-FLOOR = 1e-3  # smallest probability, and deviation (m) that is added to a particle cloud
+# They change only the free energy that is told, nothing that the agent does.
+PIXEL_STD = 1.0  # from the paper: of a crop's colours around their reconstruction; its likelihood is the squared error
+FLOOR = 1e-3  # chosen: smallest probability, and deviation (m) that is added to a particle cloud
+NEAREST_M = 0.05  # derived: the near plane of the simulator's camera
 
 
 def identity_term(presence: float, prior: float) -> float:
@@ -55,7 +56,7 @@ def crop_term(percept: Percept, before: tuple[Array, Array]) -> float:
     mean, covariance = before
     camera, focal = percept.world_from_camera, percept.intrinsics_px[0]
     pixel, depth = project(mean, camera, percept.intrinsics_px)
-    if depth < 0.05:
+    if depth < NEAREST_M:
         return 0.0
     range_m = float(np.linalg.norm(mean - camera[:3, 3]))
     ray = (mean - camera[:3, 3]) / range_m

@@ -26,6 +26,7 @@ OUTLIER = 0.05  # chosen: probability that a percept is of something else, anywh
 FRESH_SHARE = 0.05  # chosen: at least this share of the particles is drawn anew from each percept
 VAGUE_M = 0.12  # chosen: a particle cloud with a larger deviation than this says almost nothing
 BORN_VAGUE = 0.7  # chosen: share of a cloud wider than VAGUE_M that is drawn anew from a percept
+NEAREST_M = 0.05  # derived: the near plane of the simulator's camera
 MARGIN_PX = 30  # chosen: an object nearer than this to the image's border is not expected to be seen
 MOST_LOG_ODDS = 8.0  # chosen: limit of the log odds of presence, so that a few views can still change the belief
 
@@ -163,7 +164,7 @@ def in_view(points: Array, camera: Array, intrinsics_px: Array) -> NDArray[np.bo
     """Which points [N, 3] are in front of the camera and inside the image, at least MARGIN_PX from its border."""
     pixels, depth = project(points, camera, intrinsics_px)
     inside = (pixels > MARGIN_PX) & (pixels < IMAGE_SIZE_PX - MARGIN_PX)
-    return inside.all(-1) & (depth > 0.05)
+    return inside.all(-1) & (depth > NEAREST_M)
 
 
 def behind(points: Array, eye: Array, seen: list[tuple[Evidence, float]]) -> NDArray[np.bool_]:

@@ -36,6 +36,8 @@ from saccade.shared.world.task import LOWER_M, UPPER_M, Spheres, clip, spheres_a
 
 SERVICE = Service("planner", inputs=(BELIEF, GOAL_PERCEPT), trigger=BELIEF, outputs=(PLAN, ACTION))
 
+PRESENT = 0.5  # derived: an object counts as present if this is likelier than not
+NEAREST_GOAL_M = 0.1  # chosen: no candidate is nearer to the target than this
 FOUND_M = 0.06  # chosen: the target counts as found if the deviation of its position is below this
 KNOWN_M = 0.10  # chosen: an object becomes an obstacle if the deviation of its position is below this
 ARRIVED_M = 0.01  # chosen: the camera has arrived if it is within this distance of its viewpoint and within ARRIVED_RAD
@@ -139,7 +141,7 @@ class Planner:
 
     def obstacles(self, beliefs: dict[str, Belief]) -> Spheres:
         """Spheres around the objects whose presence and position the agent is sure of."""
-        known = [b for b in beliefs.values() if b.presence > 0.5 and np.trace(b.covariance_m2) < KNOWN_M ** 2]
+        known = [b for b in beliefs.values() if b.presence > PRESENT and np.trace(b.covariance_m2) < KNOWN_M ** 2]
         return spheres_around(np.array([b.mean_m for b in known]).reshape(-1, 3),
                               np.array([self.sizes_m[b.object] for b in known]).reshape(-1, 3))
 
@@ -150,7 +152,7 @@ class Planner:
         direction yet. `goal`: there is one.
         """
         target = beliefs[self.preference.target] if self.preference else None
-        if target is None or np.trace(target.covariance_m2) > FOUND_M ** 2 or target.presence <= 0.5:
+        if target is None or np.trace(target.covariance_m2) > FOUND_M ** 2 or target.presence <= PRESENT:
             return "search"
         return "approach" if target.goal_log_posterior is None else "goal"
 
@@ -206,7 +208,7 @@ class Planner:
         third, doubt, target = count // 3, self._doubt, beliefs[preference.target]
         reach = preference.range_m + rng.normal(0, SPREAD_M, third)
         away = unit(eyes[third:2 * third] - gazes[third:2 * third])
-        eyes[third:2 * third] = gazes[third:2 * third] + np.maximum(reach, 0.1)[:, None] * away
+        eyes[third:2 * third] = gazes[third:2 * third] + np.maximum(reach, NEAREST_GOAL_M)[:, None] * away
         if target.goal_log_posterior is not None:
             probabilities = np.exp(target.goal_log_posterior.astype(np.float64) / doubt).ravel()
             cells = rng.choice(len(probabilities), size=third, p=probabilities / probabilities.sum())

@@ -29,6 +29,8 @@ ALONG_FLOOR_M = 0.01  # chosen: what is added to this deviation along the ray, w
 FOUND_STD_M = 0.03  # chosen: standard deviation of the position of an object that was just found
 DETECTED = 0.9  # chosen: probability that an object in view is detected
 FARTHEST_M = 1.2  # chosen: an object that is farther away than this is not recognised
+NEAREST_M = 0.1  # chosen: an object that is nearer than this to the camera is not expected to be seen
+LOOK_AT_STD_M = 0.02  # chosen: a look-at point this far from where the object is believed is as good
 USED_VIEW = 0.85  # chosen: share of the image's half side within which an object counts as in view
 HALF_VIEW_TANGENT = USED_VIEW * IMAGE_SIZE_PX / 2 / INTRINSICS_PX[0]
 PARTICLES = 160  # chosen: about how many published particles the gain of an object not yet found is computed with
@@ -68,7 +70,7 @@ def expected_free_energy(eyes: Array, look_at: Array, beliefs: dict[str, Belief]
 
 def look_at_cost(look_at: Array, belief: Belief) -> Array:
     """-log Q(t = look-at point) for each candidate [N], in nats, up to a constant. Q is the Gaussian of the belief."""
-    covariance = belief.covariance_m2 + np.eye(3) * 0.02 ** 2
+    covariance = belief.covariance_m2 + np.eye(3) * LOOK_AT_STD_M ** 2
     offset = look_at - belief.mean_m
     return 0.5 * np.einsum("ni,ij,nj->n", offset, np.linalg.inv(covariance), offset)
 
@@ -132,7 +134,7 @@ def _in_view(eyes: Array, forward: Array, points: Array) -> NDArray[np.bool_]:
     offset = points - eyes
     ahead = (offset * forward).sum(-1)
     across = np.sqrt(np.maximum((offset ** 2).sum(-1) - ahead ** 2, 0.0))
-    return (ahead > 0.1) & (ahead < FARTHEST_M) & (across < HALF_VIEW_TANGENT * ahead)
+    return (ahead > NEAREST_M) & (ahead < FARTHEST_M) & (across < HALF_VIEW_TANGENT * ahead)
 
 
 def _gaussian_gain(eyes: Array, look_at: Array, mean: Array, covariance: Array) -> Array:

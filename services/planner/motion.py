@@ -15,16 +15,17 @@ from scipy.spatial.transform import Rotation
 from saccade.shared.world.geometry import Array, direction, euler_xyz, fibonacci_hemisphere, unit
 from saccade.shared.world.task import ACTION_LIMIT, LOWER_M, UPPER_M, Spheres, clip
 
-STEP_M = 0.05
+STEP_M = 0.05  # from the paper
 _SLACK_M = 1e-6  # numerical slack: a camera that was pushed onto the surface of a sphere counts as outside
-# Corners of a detour lie on a sphere that is larger by this factor. Then the line between two neighbours of the 48
-# corners does not cut the original sphere.
+# Derived: corners of a detour lie on a sphere that is larger by this factor. Then the line between two neighbours of
+# the 48 corners does not cut the original sphere.
 _DETOUR = 1.12
 _AZIMUTH, _ELEVATION = fibonacci_hemisphere(48)
 _CORNERS = direction(_AZIMUTH, np.arcsin(2.0 * np.sin(_ELEVATION) - 1.0))  # spread evenly over the whole sphere
-_SHELLS_M = np.arange(0.01, 0.5, 0.01)  # distances at which a position outside all spheres is searched
-_SHARES = np.linspace(0.05, 0.95, 19)  # of the way from a position to the centre of a sphere
-_WORTH_M = 0.01  # a long move into a sphere is made only if it comes nearer to the goal by more than this
+_SHELLS_M = np.arange(0.01, 0.5, 0.01)  # chosen: distances at which a position outside all spheres is searched
+_SHARES = np.linspace(0.05, 0.95, 19)  # chosen: shares of the way from a position to the centre of a sphere
+_ASIDE_M = (0.02, 0.05)  # chosen: how far from both ends a detour may begin
+_WORTH_M = 0.01  # chosen: a long move into a sphere is made only if it comes nearer to the goal by more than this
 
 
 def step_towards(world_from_camera: ArrayLike, goal_world_from_camera: ArrayLike, spheres: Spheres,
@@ -112,7 +113,7 @@ def _corners(start: Array, goal: Array, spheres: Spheres) -> Array:
     heights = np.linspace(LOWER_M[2], UPPER_M[2], 6)
     above = [np.array([*end[:2], height]) for end in (start, goal) for height in heights]
     outwards = [end + reach * away for end in (start, goal) for away in unit(end - spheres.centers_m)
-                for reach in (0.02, 0.05)]
+                for reach in _ASIDE_M]
     points = np.concatenate([around.reshape(-1, 3), above, outwards])
     return _allowed(points, spheres)
 
