@@ -16,8 +16,8 @@ SECTIONS: dict[str, type[Section]] = {"belief": BeliefConfig, "planner": Planner
 KINDS = ("chosen", "derived", "measured", "from the")  # a constant's comment begins with one of these
 # These are not listed: one is a number of the paper, the other is for the viewer only
 SHOWN = ("planner.step_m", "belief.published_particles")
-PROBABILITIES = {"PRESENT", "BORN_VAGUE", "SURE", "DETECTED", "USED_VIEW", "belief.present_above", "planner.goal_confidence",
-                 "belief.resample_below", "belief.view_worth", "belief.missed_weight"}
+PROBABILITIES = {"PRESENT", "BORN_VAGUE", "SURE", "DETECTED", "USED_VIEW", "belief.present_above",
+                 "planner.goal_confidence", "belief.resample_below", "belief.view_worth", "belief.missed_weight"}
 
 
 @dataclass(frozen=True)
