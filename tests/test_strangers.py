@@ -5,6 +5,7 @@ from __future__ import annotations
 import queue
 import threading
 from contextlib import closing
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -200,6 +201,24 @@ def test_what_cannot_be_there_yet_is_not_recorded(recorder):
     recorder.log.close()
     found = [(topic, message.episode) for topic, _, message in RunReader(recorder.log.path) if topic != STATUS]
     assert found == [(TRUTH, 0), (TRUTH, 1), (RESULT, 1), (TRUTH, 5)]
+
+
+def test_a_recorder_that_waits_for_an_answer_in_vain_does_not_ask_at_every_message(recorder, monkeypatch):
+    clock, asked = [100.0], []
+    monkeypatch.setattr("saccade.services.recorder.core.time", SimpleNamespace(monotonic=lambda: clock[0]))
+
+    def in_vain(topics, *_: object) -> list:
+        asked.append(topics)
+        clock[0] += 3.0
+        return []
+
+    monkeypatch.setattr(recorder._bus, "recall", in_vain)
+    recorder._news_s = clock[0]
+    clock[0] += 2.0
+    recorder._work_off(status("planner", "ready"))
+    first = len(asked)
+    recorder._work_off(status("planner", "ready"))
+    assert (len(asked), first > 0) == (first, True)
 
 
 def test_only_the_source_says_that_the_run_is_over(recorder):

@@ -109,9 +109,9 @@ class Recorder:
         if item is not None and item[0].in_step:
             self._news_s = time.monotonic()
         elif time.monotonic() - self._news_s >= QUIET_S:
-            self._news_s = time.monotonic()
             self._ask_for_news()
             self._ask_for_missing()
+            self._news_s = time.monotonic()  # now: whoever never answers takes as long as may be waited for
 
     def _open(self, path: Path, config: Config) -> RunLog:
         """Opens the log, with the messages of a log that a killed recorder has left."""

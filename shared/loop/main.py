@@ -91,9 +91,9 @@ def serve(service: Service, core: Core, bus: Bus, parts: tuple[str, ...], *, run
             if item is not None and item[0] != STATUS:
                 news_s = time.monotonic()
             elif time.monotonic() - news_s >= IDLE_S:
-                news_s = time.monotonic()
                 loop.catch_up()
                 loop.say_what_lacks()
+                news_s = time.monotonic()  # now: whoever never answers takes as long as may be waited for
     return loop.health
 
 
