@@ -13,6 +13,7 @@ import pytest
 from saccade.app.log.check import missing
 from saccade.app.run import follow as following
 from saccade.app.run.follow import Course, Messages, follow
+from saccade.app.run.halt import Pulse
 from saccade.app.run.supervisor import Process
 from saccade.services.recorder.core import Recorder
 from saccade.services.viewer.live import _Feed
@@ -84,8 +85,8 @@ def test_a_run_ends_with_its_own_results_and_with_no_others():
     ready = [status(name, "ready") for name in ("simulator", "planner", "evaluator")]
     heard, _, told = stream(
         *ready, status("simulator", "finished", run="zz"), said(RESULT, FAR, scene="FORGED"),
-        said(RESULT, 7, scene="FORGED"), said(RESULT, 1, scene="FORGED"), said(PLAN, FAR), status("evil", "finished"),
-        said(RESULT, 0), said(PLAN, 1), status("simulator", "ready", episode=1), said(RESULT, 1),
+        said(RESULT, 7, scene="FORGED"), said(RESULT, 1, scene="FORGED"), said(PLAN, FAR), said(TRUTH, 7),
+        status("evil", "finished"), said(RESULT, 0), said(PLAN, 1), status("simulator", "ready", episode=1), said(RESULT, 1),
         status("simulator", "finished", episode=1))
     results = follow(heard, Heard(), PROCESSES, None, live=False)
     assert [(result.episode, result.scene) for result in results] == [(0, "mug"), (1, "mug")]
@@ -203,6 +204,16 @@ def test_what_cannot_be_there_yet_is_not_recorded(recorder):
     assert found == [(TRUTH, 0), (TRUTH, 1), (RESULT, 1), (TRUTH, 5)]
 
 
+def test_an_object_that_the_run_does_not_have_is_not_recorded(tmp_path):
+    config = Config().with_values({"run": "r", "scene.names": ["mug"]})
+    recorder = Recorder(LocalBus(), tmp_path, config)
+    for part in ("evil", "mug"):
+        recorder._take(PERCEPT, part, encode(sample(PERCEPT.type, run="r", episode=0, step=0, seq=0, object=part)))
+    recorder.log.close()
+    assert [entry.part for entry in RunReader(recorder.log.path).entries()] == ["mug"]
+    assert recorder.health.refused == 1
+
+
 def test_a_recorder_that_waits_for_an_answer_in_vain_does_not_ask_at_every_message(recorder, monkeypatch):
     clock, asked = [100.0], []
     monkeypatch.setattr("saccade.services.recorder.core.time", SimpleNamespace(monotonic=lambda: clock[0]))
@@ -271,3 +282,12 @@ def test_a_viewer_shows_one_run():
         feed.take(*said(FRAME, run=run, rgb=np.zeros((4, 5, 3), np.uint8)))
     feed.take(*status("planner", "ready", run=""))
     assert shown == ["r", ""]
+
+
+def test_a_halt_names_what_is_waited_for_and_not_what_was_refused(monkeypatch):
+    monkeypatch.setattr("saccade.app.run.halt.HALTED_S", 0.0)
+    pulse = Pulse({"planner", "recorder"})
+    for name, note in (("planner", "waits for belief/mug"), ("recorder", "refused: status/x: it is of the run 'zz'")):
+        told = sample(Status, run="r", service=name, state="ready", note=note)
+        pulse.take(STATUS, name, told)
+    assert pulse.halted() == "the run came to a halt: planner waits for belief/mug"

@@ -183,10 +183,10 @@ class Course:
         self._planned, self._news_s = (-1, -1), time.monotonic()
 
     def refusal(self, topic: Topic, part: str | None, message: Message) -> str | None:
-        """Says why a message cannot be one of this run: there is no result of an episode that has not begun, and no
-        plan of an episode after the next one. A result that overtook everything else of its episode comes again when
-        it is asked for."""
-        if topic in (RESULT, PLAN) and message.episode > self._reached + (topic == PLAN):
+        """Says why a message cannot be one of this run: there is no result of an episode that has not begun, and
+        nothing of an episode after the next one. A result that overtook everything else of its episode comes again
+        when it is asked for."""
+        if topic.in_step and message.episode > self._reached + (topic != RESULT):
             return (f"a {topic.name} of episode {message.episode} came while episode {self._reached} went on: it is "
                     "ignored")
         return None

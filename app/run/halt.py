@@ -7,6 +7,7 @@ import time
 from saccade.app.run.supervisor import HUNG_S
 from saccade.shared.bus.messages import Message, Status
 from saccade.shared.bus.topics import Topic
+from saccade.shared.loop.process import REFUSED
 
 HALTED_S = 8.0  # the run has come to a halt if all services wait for so long and none takes a step
 IDLE_STATES = ("ready", "finished", "not recording")
@@ -42,8 +43,10 @@ class Pulse:
             self._moved_s = now_s
         if now_s - self._moved_s < HALTED_S:
             return None
+        told = [(name, status) for name, (status, _) in sorted(self._last.items()) if status.note]
+        reasons = [one for one in told if not one[1].note.startswith(REFUSED)]  # what was refused is seldom the reason
         notes = [f"{name} {status.note}" if status.state == "ready" else f"{name} is {status.state}: {status.note}"
-                 for name, (status, _) in sorted(self._last.items()) if status.note]
+                 for name, status in reasons or told]
         return f"the run came to a halt: {'; '.join(notes) or 'all services wait, and none says for what'}"
 
 

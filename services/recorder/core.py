@@ -238,6 +238,8 @@ class Recorder:
             return stranger(message, part, self._run)
         if message.run != self._run:
             return f"it is of the run {told(message.run)}, not of {told(self._run)}"
+        if topic.parts and self._names and part not in self._names:
+            return f"{told(part)} is not an object of this run"
         return self._ahead(topic, message)
 
     def _ahead(self, topic: Topic, message: Message) -> str | None:

@@ -246,6 +246,8 @@ class _Loop:
             self.health.say(note=WAITS + ", ".join(lacks))
 
     def _note_status(self, part: str | None, payload: bytes) -> None:
+        if not self.awaited:
+            return
         try:
             status = decode(STATUS.type, payload)
         except MessageError:
