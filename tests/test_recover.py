@@ -175,7 +175,7 @@ def test_logs_of_other_writers_too(tmp_path, compression):
     with path.open("wb") as stream:
         writer = Writer(stream, compression=compression, chunk_size=1)
         writer.start()
-        channel = writer.register_channel("saccade/table/action", "raw", 0)
+        channel = writer.register_channel("saccade/table/action", "msgpack", 0)
         for i in range(6):
             ends.append(stream.tell())
             writer.add_message(channel, i, bytes([i]) * 3000, i, i)

@@ -86,8 +86,8 @@ def test_a_run_ends_with_its_own_results_and_with_no_others():
     heard, _, told = stream(
         *ready, status("simulator", "finished", run="zz"), said(RESULT, FAR, scene="FORGED"),
         said(RESULT, 7, scene="FORGED"), said(RESULT, 1, scene="FORGED"), said(PLAN, FAR), said(TRUTH, 7),
-        status("evil", "finished"), said(RESULT, 0), said(PLAN, 1), status("simulator", "ready", episode=1), said(RESULT, 1),
-        status("simulator", "finished", episode=1))
+        status("evil", "finished"), said(RESULT, 0), said(PLAN, 1), status("simulator", "ready", episode=1),
+        said(RESULT, 1), status("simulator", "finished", episode=1))
     results = follow(heard, Heard(), PROCESSES, None, live=False)
     assert [(result.episode, result.scene) for result in results] == [(0, "mug"), (1, "mug")]
     assert any("a result of episode 7 came while episode 0 went on" in text for text in told), told
