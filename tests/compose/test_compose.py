@@ -158,6 +158,18 @@ def test_other_weights_by_name(compose):
     assert "/saccade/weights/nobodys/manifest.json are missing" in compose.until_said("saccade: ")
 
 
+def test_another_agent_by_name_and_the_services_it_does_without_wait_for_the_end(compose):
+    said = compose.up(SACCADE_AGENT="random-walk", SACCADE_SET="simulator.max_steps=5")
+    assert "in 5 steps" in said or "reached the goal in" in said
+    assert load(compose.run / "config.json").services.planner == "saccade.services.planner.random_walk"
+    topics = {topic for topic, _, _ in RunReader(compose.run / "run.mcap")}
+    assert ACTION in topics
+    assert PERCEPT not in topics
+    for service in ("perception", "belief"):
+        assert compose.inspect(service)["State"]["ExitCode"] == 0, service
+    assert compose.log().complete, list(compose.log().lines())
+
+
 def test_a_second_simulator_is_refused_and_the_run_goes_on(compose):
     said = compose.up("--scale", "simulator=2")
     assert said.count("saccade: another simulator is in this world already") == 1
