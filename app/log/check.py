@@ -178,7 +178,8 @@ def _unfinished(reader: RunReader, there: There) -> tuple[str | None, list[tuple
                 "step; start a new run for the rest"), [], []
     told = reader.metadata[FINISHED].get("episodes", "")
     count = int(told) if told.isascii() and told.isdigit() and len(told) < 20 else 0
-    beyond = sorted(episode for episode in found | {episode for _, episode in there.held} if episode >= count)
+    all_found = found | {episode for _, episode in there.held}
+    beyond = sorted(episode for episode in all_found if 0 < count <= episode)
     return (None, list(itertools.islice(between(found, 0, count - 1), MOST_ABSENT)),
             [(episode, episode) for episode in beyond[:MOST_ABSENT]])
 
