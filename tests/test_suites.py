@@ -64,8 +64,8 @@ def test_yaws():
     def turned(name):
         return np.mean([any(p.yaw_rad != 0 for p in scene.objects) for scene in scenes_of(name)])
 
-    assert {name: turned(name) for name in DRAWN} == {"yaw-500": 1, "lexa-room": 0, "dev": 0.5, "paper-like": 0,
-                                                      "paper-like-yaw": 1}
+    assert {name: turned(name) for name in DRAWN} == {"yaw-500": 1, "lexa-room": 0, "looks": 1, "dev": 0.5,
+                                                      "paper-like": 0, "paper-like-yaw": 1}
 
 
 def test_the_room_stays_as_it_is():
