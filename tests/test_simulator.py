@@ -212,7 +212,7 @@ def damaged_scan(folder, fault):
     """A YCB folder with four points in it, and something wrong."""
     scan = folder / "003_cracker_box"
     scan.mkdir()
-    obj = "v 0 0 0\nv 0 0 1\nv 0 1 0\nv 1 0 0\nvt 0 0\nvt 0 1\nvt 1 0\nf 1/1 2/2 3/3\n"
+    obj = "v 0 0 0\nv 0 0 1\nv 0 1 0\nv 1 0 0\nvt 0 0\nvt 0 1\nvt 1 0\nf 1/1 2/2 4/3\nf 1/1 2/2 3/3\n"
     if fault == "face":
         obj = obj.replace("3/3", "9/3")
     if fault != "no mesh":
