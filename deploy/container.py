@@ -22,7 +22,7 @@ from pathlib import Path
 from saccade.app.run.supervisor import HUNG_KILLED_S, KEEP_PAGES, STOP_S, VIEWER
 from saccade.app.run.threads import VARIABLES
 from saccade.shared.bus.transport import ROUTER_WAIT_VARIABLE
-from saccade.shared.config import load
+from saccade.shared.config import ServicesConfig, load
 from saccade.shared.errors import SaccadeError
 from saccade.shared.log.folder import CONFIG_NAME
 from saccade.shared.loop.process import EXIT_ERROR, HEARTBEAT_VARIABLE, LAUNCHER_VARIABLE
@@ -32,7 +32,6 @@ WORLD_VARIABLE, WAIT_VARIABLE = "SACCADE_WORLD", "SACCADE_WAIT"
 LATEST, OVER = "latest", "over"  # a link to the newest run, and a mark in the folder of a world that is over
 ONE_FOR_ALL = ("router", "viewer")  # all worlds share the router, and the viewer shows the first world
 VIEW_VARIABLE, VIEW_S = "SACCADE_VIEW_S", 300.0  # the viewer stays so long after a run
-PARTS_OF_AGENTS = ("perception", "belief", "planner")
 POLL_S = 0.2
 ROUTER_S = 60.0  # a service waits so long for the router, because containers start in any order
 # A process that is told to stop before it has begun gets less time: what it waits for may never come.
@@ -74,7 +73,7 @@ def takes_part(name: str, world: Path) -> bool:
     """Whether a world needs a service. An agent may do without one of those that others have. Raises SaccadeError if
     the world's configuration cannot be read."""
     awaited = load(world / CONFIG_NAME).bus.wait_for
-    if name not in PARTS_OF_AGENTS or name in awaited or not awaited:
+    if name not in ServicesConfig.model_fields or name in awaited or not awaited:
         return True
     print(f"saccade: {name} has no part in this run", file=sys.stderr, flush=True)
     return False

@@ -15,11 +15,10 @@ from rich.console import Console
 import saccade
 from saccade.app.bench.bench import bench, prepare
 from saccade.app.run.run import run
-from saccade.shared.bus.topics import STATUS
 from saccade.shared.config import PACKAGE, Config
 from saccade.shared.errors import SaccadeError
-from saccade.shared.log.reading import RunReader
 from saccade.shared.loop.modules import load
+from saccade.tests.fakes.logs import logged
 
 GREEDY = {"services.planner": "greedy_planner"}
 EPISODE = {"scene.names": ["soup_can", "rice_box"], "scene.n_objects": 2, "simulator.max_steps": 8,
@@ -50,14 +49,6 @@ def importable(monkeypatch, tmp_path):
 def code_of(page: str, title: str) -> str:
     """The program with this title on a page of the guide."""
     return (PACKAGE / "docs" / page).read_text().partition(f'title="{title}"\n')[2].partition("\n```")[0] + "\n"
-
-
-def logged(log) -> dict:
-    messages: dict = {}
-    for entry in RunReader(log).entries():
-        if entry.topic != STATUS:
-            messages.setdefault((entry.topic.name, entry.part), []).append(entry.payload)
-    return messages
 
 
 def test_a_planner_of_ones_own_runs_on_the_bus_and_in_one_process_alike(tmp_path):

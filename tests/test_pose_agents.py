@@ -17,7 +17,6 @@ from saccade.services.perception.posecnn import hough_center, network_input, rot
 from saccade.services.perception.templates import TemplateMatcher
 from saccade.services.planner.follow import Follower, goal_view
 from saccade.shared.bus.messages import Percept
-from saccade.shared.bus.topics import STATUS
 from saccade.shared.config import Config
 from saccade.shared.errors import SaccadeError
 from saccade.shared.log.reading import RunReader
@@ -36,6 +35,7 @@ from saccade.shared.world.geometry import (
     rotation_xyz,
 )
 from saccade.shared.world.task import apply_action, start_pose, success
+from saccade.tests.fakes.logs import logged
 from saccade.tests.fakes.training import assert_same_checkpoint, interrupt_and_resume
 from saccade.tests.fakes.weights import write_random_weights
 from saccade.tests.samples import sample
@@ -125,14 +125,6 @@ def test_training_continues_as_if_it_had_not_been_interrupted_and_its_weights_se
     trained = Weights(tmp_path / "weights")
     assert (trained.architecture, trained.names) == ("posecnn", NAMES)
     assert set(trained.calibration) == {f"{name}.{what}" for name in NAMES for what in ("pixel_std", "log_scale_std")}
-
-
-def logged(log) -> dict:
-    messages: dict = {}
-    for entry in RunReader(log).entries():
-        if entry.topic != STATUS:
-            messages.setdefault((entry.topic.name, entry.part), []).append(entry.payload)
-    return messages
 
 
 @pytest.mark.parametrize("agent", ["posecnn", "posecnn-infogain"])

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from safetensors import safe_open
@@ -18,17 +20,27 @@ CHECKPOINT = "checkpoint.safetensors"
 
 def read_checkpoint(path: Path) -> tuple[dict, dict[str, Tensor]]:
     """The facts (such as the step) and the tensors of a checkpoint. Raises SaccadeError if it is damaged."""
-    try:
-        with safe_open(path, "pt") as file:
-            facts = json.loads(file.metadata()["facts"])
+    facts = _facts(path)
+    with _whole(path):
         return facts, load_file(path)
+
+
+def _facts(path: Path) -> dict:
+    with _whole(path), safe_open(path, "pt") as file:
+        return json.loads(file.metadata()["facts"])
+
+
+@contextmanager
+def _whole(path: Path) -> Iterator[None]:
+    try:
+        yield
     except Exception as error:  # safetensors raises its own class for every kind of damage
         raise SaccadeError(f"checkpoint {path} is damaged ({error}): remove it to train this part anew") from error
 
 
 def step_of(path: Path) -> int:
     """The step of a checkpoint, 0 if there is none. Raises SaccadeError if it is damaged."""
-    return int(read_checkpoint(path)[0]["step"]) if path.is_file() else 0
+    return int(_facts(path)["step"]) if path.is_file() else 0
 
 
 def model_of(tensors: dict[str, Tensor]) -> dict[str, Tensor]:

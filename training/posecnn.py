@@ -13,7 +13,7 @@ from saccade.services.perception.posecnn import (
     CELLS,
     LABEL_PX,
     PoseNetwork,
-    hough_center,
+    counted,
     region_side,
     rotation_of,
 )
@@ -48,7 +48,7 @@ class PoseCnnTask:
         # In units of each object's size, so that large and small objects count alike.
         points = [p / np.linalg.norm(mesh.size_m) for p, mesh in zip(points, meshes, strict=True)]
         self.points = torch.tensor(np.stack(points), dtype=torch.float32, device=device)
-        self.sides_m = torch.tensor([crop_side_m(mesh.size_m) for mesh in meshes], device=device)
+        self.sides_m = torch.tensor([crop_side_m(mesh.size_m) for mesh in meshes], dtype=torch.float32, device=device)
         self.symmetric = torch.tensor([name in config.symmetric for name in config.names], device=device)
 
     def _batch(self, count: int, step: int) -> RenderedBatch:
@@ -78,7 +78,7 @@ class PoseCnnTask:
         """
         image, which = found.T
         center, log_scale = batch.center[image, which], batch.log_scale[image, which]
-        side = self.sides_m[which].float() * log_scale.exp() * float(region_side(1.0, 1.0, FOCAL_WIDTHS))
+        side = region_side(self.sides_m[which], log_scale.exp(), FOCAL_WIDTHS)
         if generator is not None:
             noise = torch.randn(len(found), 3, generator=generator, device=self.device) * JITTER
             center, side = center + noise[:, :2] * side[:, None], side * noise[:, 2].exp()
@@ -150,11 +150,7 @@ def voted_errors(votes: Tensor, batch: RenderedBatch, found: Tensor) -> tuple[Te
     for image, which in found.tolist():
         shown = (batch.label[image] == which + 1).float()
         weight = F.avg_pool2d(shown[None], LABEL_PX // CELLS)[0].flatten()
-        chosen = weight.nonzero()[:, 0]
-        cells = torch.stack([(chosen % CELLS + 0.5) / CELLS, (chosen // CELLS + 0.5) / CELLS], dim=-1).cpu()
-        voted = votes[image, which].flatten(1)[:, chosen].float().cpu()
-        center, inliers = hough_center(cells, F.normalize(voted[:2].T, dim=-1), weight[chosen].cpu())
-        inliers = inliers if inliers.any() else torch.ones_like(inliers)
+        center, log_scale = counted(votes[image, which].float().cpu(), weight.cpu())
         pixels.append((center - batch.center[image, which].cpu()).norm() * IMAGE_SIZE_PX)
-        ranges.append((voted[2][inliers].mean() - batch.log_scale[image, which].cpu()).abs())
+        ranges.append((log_scale - batch.log_scale[image, which].cpu()).abs())
     return torch.stack(pixels), torch.stack(ranges)

@@ -158,10 +158,8 @@ def _training(agent: str, objects: str) -> str:
     if not AGENTS[agent].weights:
         return "not at all"
     manifest = Weights(_configuration(agent, objects).weights).manifest
-    said = [str(manifest[key]) for key in ("data",) if key in manifest]
-    if "seconds" in manifest:
-        said.append(f"{float(manifest['seconds']) / 3600:.1f} hours on {manifest.get('where_trained', 'unknown')}")
-    return "; ".join(said) or "unknown"
+    hours = f"{manifest['seconds'] / 3600:.1f}" if "seconds" in manifest else "unknown"
+    return f"{manifest.get('data', 'unknown')}; {hours} hours on {manifest.get('where_trained', 'unknown')}"
 
 
 def _share(row: Row) -> str:

@@ -28,7 +28,7 @@ from saccade.shared.errors import SaccadeError
 from saccade.shared.log.folder import CONFIG_NAME, LOG_NAME
 from saccade.shared.log.reading import Recorded, RunReader
 from saccade.shared.log.recording import RunLog
-from saccade.shared.loop.main import READY_STATES
+from saccade.shared.loop.episodes import READY_STATES
 from saccade.shared.loop.service import Service
 from saccade.shared.loop.stepper import Stepper, settle
 

@@ -119,9 +119,8 @@ class PaperSceneCCN:
         decoder = Stacked([weights.fill(decoder_of("paper"), name, "ccn.decoder.") for name in names])
         networks = (extraction, encoder, decoder)
         self.extraction, self.encoder, self.decoder = (n.one_by_one if one_by_one else n for n in networks)
-        self.pixel_std, self.log_scale_std = (
-            np.array([weights.calibration.get(f"{name}.{what}", otherwise) for name in names])
-            for what, otherwise in (("pixel_std", PIXEL_STD), ("log_scale_std", LOG_SCALE_STD)))
+        self.pixel_std = weights.calibrated(names, "pixel_std", PIXEL_STD)
+        self.log_scale_std = weights.calibrated(names, "log_scale_std", LOG_SCALE_STD)
 
     @torch.inference_mode()
     def see(self, rgb: NDArray[np.uint8], intrinsics_px: ArrayLike, up: ArrayLike,

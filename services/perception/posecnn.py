@@ -7,6 +7,8 @@ weights hold one network for all objects; their manifest says "architecture": "p
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import numpy as np
 import torch
 import torch.nn.functional as F
@@ -27,6 +29,7 @@ DEPTH_M, DEPTH_SPAN_M = 0.5, 0.5  # a depth enters as (depth - 0.5 m) / 0.5 m, a
 FEW_CELLS = 3.0  # so many labelled cells make the presence half as sure
 MOST_VOTERS = 200  # more cells of one object say nothing new
 INLIERS = (0.95, 0.99)  # cosine of the largest angle between a vote and the direction to a centre that it supports
+Numbers = TypeVar("Numbers", NDArray[np.float64], Tensor)
 _SPAN = (-0.25, 1.25)  # where centres are looked for, in image widths
 _CANDIDATES = 61  # per axis
 PIXEL_STD, LOG_SCALE_STD = 8.0, 0.08  # of a percept, if the manifest gives none
@@ -119,9 +122,9 @@ def rotation_of(quaternion: Tensor) -> Tensor:
     return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
 
 
-def region_side(crop_side_m: ArrayLike, scale: ArrayLike, focal_widths: float) -> NDArray[np.float64]:
-    """The side of an object's region in image widths, from the side of its crop (m) and 0.40 m / range."""
-    return np.asarray(crop_side_m) * np.asarray(scale) / REFERENCE_RANGE_M * focal_widths
+def region_side(crop_side_m: Numbers, scale: Numbers, focal_widths: float) -> Numbers:
+    """The sides of objects' regions in image widths, from the sides of their crops (m) and 0.40 m / range."""
+    return crop_side_m * scale * (focal_widths / REFERENCE_RANGE_M)
 
 
 class PoseCNN:
@@ -130,13 +133,13 @@ class PoseCNN:
 
     def __init__(self, weights: Weights, names: tuple[str, ...]):
         self.cards = weights.cards_of(names)
+        self.sides_m = np.array([card.crop_side_m for card in self.cards])
         self.rows = [weights.names.index(name) for name in names]
         network = weights.fill(PoseNetwork(len(weights.names)), "posecnn")
         assert isinstance(network, PoseNetwork)  # it is what was filled
         self.network = network
-        self.pixel_std, self.log_scale_std = (
-            np.array([weights.calibration.get(f"{name}.{what}", otherwise) for name in names])
-            for what, otherwise in (("pixel_std", PIXEL_STD), ("log_scale_std", LOG_SCALE_STD)))
+        self.pixel_std = weights.calibrated(names, "pixel_std", PIXEL_STD)
+        self.log_scale_std = weights.calibrated(names, "log_scale_std", LOG_SCALE_STD)
 
     @torch.inference_mode()
     def see(self, rgb: NDArray[np.uint8], intrinsics_px: ArrayLike, up: ArrayLike,
@@ -156,7 +159,7 @@ class PoseCNN:
             found = _tally(shares[row + 1], (label == row + 1).float(), votes[0, row])
             if found is not None:
                 presence[k], pixel[k], scale[k] = found[0], found[1] * width, found[2]
-        side = region_side([card.crop_side_m for card in self.cards], scale, focal / width)
+        side = region_side(self.sides_m, scale, focal / width)
         quaternion = self.network.quaternions(
             features.expand(count, -1, -1, -1), torch.tensor(pixel / width, dtype=torch.float32),
             torch.tensor(side, dtype=torch.float32), torch.tensor(self.rows))
@@ -178,11 +181,18 @@ def _tally(share: Tensor, label: Tensor, votes: Tensor) -> tuple[float, NDArray[
     total = float(weight.sum())
     if total == 0.0:
         return None
+    center, log_scale = counted(votes, weight)
+    sure = float((share * label).sum() / label.sum())
+    scale = float(log_scale.clamp(-2.0, 2.0).exp())
+    return sure * total / (total + FEW_CELLS), center.clamp(-0.5, 1.5).double().numpy(), scale
+
+
+def counted(votes: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """The centre [2] in image widths and log(0.40 m / range) by the votes [3, 40, 40] of the cells that have a weight
+    [1600]."""
     chosen = weight.topk(min(MOST_VOTERS, int((weight > 0).sum()))).indices
     cells = torch.stack([(chosen % CELLS + 0.5) / CELLS, (chosen // CELLS + 0.5) / CELLS], dim=-1)
     voted, weight = votes.flatten(1)[:, chosen], weight[chosen]
     center, inliers = hough_center(cells, F.normalize(voted[:2].T, dim=-1), weight)
-    counted = weight * inliers if inliers.any() else weight
-    scale = float(((voted[2] * counted).sum() / counted.sum()).clamp(-2.0, 2.0).exp())
-    sure = float((share * label).sum() / label.sum())
-    return sure * total / (total + FEW_CELLS), center.clamp(-0.5, 1.5).double().numpy(), scale
+    supporting = weight * inliers if inliers.any() else weight
+    return center, (voted[2] * supporting).sum() / supporting.sum()

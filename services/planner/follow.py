@@ -11,7 +11,8 @@ from collections.abc import Iterable
 import numpy as np
 
 from saccade.services.planner.motion import step_towards
-from saccade.shared.bus.messages import Action, Percept, Plan
+from saccade.services.planner.outputs import outputs
+from saccade.shared.bus.messages import Percept
 from saccade.shared.bus.topics import ACTION, GOAL_PERCEPT, PERCEPT, PLAN, Output
 from saccade.shared.config import Config
 from saccade.shared.errors import SaccadeError
@@ -69,29 +70,18 @@ class Follower:
         move = step_towards(camera, viewpoint, spheres, self.step_m)
         arrived = distance < ARRIVED_M and turn < ARRIVED_RAD
         center = (camera @ np.asarray(percept.camera_from_object))[:3, 3]
-        return _outputs(percept, goal, viewpoint, center, move, distance, arrived)
+        return outputs(percept, viewpoint, move, look_at_m=center, target=goal.object, goal_confidence=goal.presence,
+                       believed_distance_m=distance, arrived=arrived)
 
     def _stop(self, percept: Percept, goal: Percept) -> Iterable[Output]:
-        camera = np.array(percept.world_from_camera)
-        ahead = camera[:3, 3] - 0.4 * camera[:3, 2]
-        return _outputs(percept, goal, camera, ahead, (np.zeros(3), np.zeros(3)), -1.0, arrived=False)
+        return outputs(percept, np.array(percept.world_from_camera), (np.zeros(3), np.zeros(3)), target=goal.object,
+                       goal_confidence=goal.presence)
 
 
 def goal_view(percept: Percept, goal: Percept) -> Array:
     """The pose world_from_camera [4, 4] from which the goal image was taken, by the target's poses in both images."""
     there = np.linalg.inv(np.asarray(goal.camera_from_object))
     return np.asarray(percept.world_from_camera @ np.asarray(percept.camera_from_object) @ there)
-
-
-def _outputs(percept: Percept, goal: Percept, viewpoint: Array, look_at: Array, move: tuple[Array, Array],
-             distance_m: float, arrived: bool) -> Iterable[Output]:
-    mode = "goal" if distance_m >= 0.0 else "search"
-    plan = Plan(run=percept.run, episode=percept.episode, step=percept.step, target=goal.object, mode=mode,
-                viewpoint=viewpoint, look_at_m=look_at, g_position=0.0, g_scale=0.0, g_pose=0.0, g_information=0.0,
-                candidates=1, goal_confidence=goal.presence, believed_distance_m=distance_m, arrived=arrived)
-    yield Output(PLAN, plan)
-    yield Output(ACTION, Action(run=plan.run, episode=plan.episode, step=plan.step, translation_m=move[0],
-                                rotation_rad=move[1], arrived=arrived))
 
 
 def build(config: Config) -> Follower:

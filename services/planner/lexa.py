@@ -7,7 +7,7 @@ acts on this state. `training/lexa` trains it in one room. The weights' manifest
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -17,7 +17,7 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from saccade.services.planner.baselines import outputs
+from saccade.services.planner.outputs import step_from
 from saccade.shared.bus.messages import Frame, Goal
 from saccade.shared.bus.topics import ACTION, FRAME, GOAL, PLAN, Output
 from saccade.shared.config import Config
@@ -126,6 +126,12 @@ class Actor(nn.Module):
         super().__init__()
         self.encoder, self.model, self.achiever = ImageEncoder(), StateSpaceModel(), Policy(FEATURE + EMBEDDED)
 
+    def fold(self, state: State, action: Tensor, image: Tensor, pick: Callable[[Tensor], Tensor]) -> State:
+        """The state after an action [B, 6] and the image [B, 3, 64, 64] that followed. `pick` chooses the sample from
+        the log probabilities of the posterior."""
+        deterministic, _ = self.model(state, action)
+        return State(deterministic, pick(self.model.observe(deterministic, self.encoder(image))))
+
 
 def small(rgb: NDArray[np.uint8]) -> Tensor:
     """An image [H, W, 3] as the network sees it [1, 3, 64, 64]."""
@@ -158,18 +164,17 @@ class Lexa:
     @torch.inference_mode()
     def step(self, inputs: Inputs) -> Iterable[Output]:
         """Yields a plan and an action, from the images so far. Without a goal image the camera stands still."""
-        frame, goal = inputs["frame"], inputs["goal"]
-        if not isinstance(frame, Frame) or not isinstance(goal, Goal) or goal.rgb is None:
-            return outputs(frame, np.zeros(3), np.zeros(3))
+        frame: Frame = inputs["frame"]
+        goal: Goal = inputs["goal"]
+        if goal.rgb is None:
+            return step_from(frame, (np.zeros(3), np.zeros(3)))
         if self.goal is None:
             self.goal = self.actor.encoder(small(goal.rgb))
-        deterministic, _ = self.actor.model(self.state, self.action)
-        seen = self.actor.model.observe(deterministic, self.actor.encoder(small(frame.rgb)))
-        self.state = State(deterministic, likeliest(seen))
+        self.state = self.actor.fold(self.state, self.action, small(frame.rgb), likeliest)
         mean, _ = self.actor.achiever(torch.cat([self.state.feature, self.goal], dim=-1))
         self.action = torch.tanh(mean)
         move = self.action[0].double().numpy() * SCALE
-        return outputs(frame, move[:3], move[3:])
+        return step_from(frame, (move[:3], move[3:]))
 
 
 def build(config: Config) -> Lexa:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial.transform import Rotation
 
-from saccade.shared.world.geometry import Array, direction, euler_xyz, fibonacci_hemisphere, unit
+from saccade.shared.world.geometry import Array, euler_xyz, fibonacci_sphere, unit
 from saccade.shared.world.task import ACTION_LIMIT, LOWER_M, UPPER_M, Spheres, clip
 
 STEP_M = 0.05  # from the paper
@@ -20,8 +20,7 @@ _SLACK_M = 1e-6  # numerical slack: a camera that was pushed onto the surface of
 # Derived: corners of a detour lie on a sphere that is larger by this factor. Then the line between two neighbours of
 # the 48 corners does not cut the original sphere.
 _DETOUR = 1.12
-_AZIMUTH, _ELEVATION = fibonacci_hemisphere(48)
-_CORNERS = direction(_AZIMUTH, np.arcsin(2.0 * np.sin(_ELEVATION) - 1.0))  # spread evenly over the whole sphere
+_CORNERS = fibonacci_sphere(48)
 _SHELLS_M = np.arange(0.01, 0.5, 0.01)  # chosen: distances at which a position outside all spheres is searched
 _SHARES = np.linspace(0.05, 0.95, 19)  # chosen: shares of the way from a position to the centre of a sphere
 _ASIDE_M = (0.02, 0.05)  # chosen: how far from both ends a detour may begin

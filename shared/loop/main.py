@@ -17,7 +17,6 @@ from saccade.shared.bus.transport import Bus, ZenohBus
 from saccade.shared.bus.wire import MessageError, decode, encode, stamp_of
 from saccade.shared.config import Config
 from saccade.shared.errors import SaccadeError
-from saccade.shared.loop.episodes import READY_STATES as READY_STATES
 from saccade.shared.loop.episodes import Episodes, stranger
 from saccade.shared.loop.modules import ServiceModule, load
 from saccade.shared.loop.process import DRAIN_S, Health, Heartbeat, Inbox, run_process

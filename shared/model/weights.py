@@ -87,6 +87,10 @@ class Weights:
                 raise SaccadeError(f"object {name!r} has no weights in {self.folder}: train it with `saccade train`")
         return tuple(known[name] for name in names)
 
+    def calibrated(self, names: tuple[str, ...], what: str, otherwise: float) -> NDArray[np.float64]:
+        """Returns the calibration `what` of these objects [K]. An object without it gets `otherwise`."""
+        return np.array([self.calibration.get(f"{name}.{what}", otherwise) for name in names])
+
     def state(self, stem: str, prefix: str = "") -> dict[str, NDArray[np.float32]]:
         """Returns the arrays of `<stem>.safetensors` whose names begin with `prefix`, by their names without it.
 

@@ -142,8 +142,8 @@ def fibonacci_hemisphere(count: int) -> tuple[Array, Array]:
 
 def fibonacci_sphere(count: int) -> Array:
     """`count` unit vectors [count, 3], spread evenly over the whole sphere."""
-    index = np.arange(count) + 0.5
-    return direction(wrap(index * np.pi * (3.0 - np.sqrt(5.0))), np.arcsin(1.0 - 2.0 * index / count))
+    azimuth, elevation = fibonacci_hemisphere(count)
+    return direction(azimuth, np.arcsin(2.0 * np.sin(elevation) - 1.0))
 
 
 GRID_ELEVATIONS, GRID_AZIMUTHS = 18, 72  # cells of 5 degrees

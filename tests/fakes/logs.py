@@ -65,6 +65,15 @@ def so_far(log):
         return []
 
 
+def logged(log):
+    """The payloads of a log by (topic, part), in their order, without statuses, which depend on time."""
+    messages = {}
+    for entry in RunReader(log).entries():
+        if entry.topic != STATUS:
+            messages.setdefault((entry.topic.name, entry.part), []).append(entry.payload)
+    return messages
+
+
 def write(path, messages, *, configuration="{}"):
     """A log with a message every millisecond."""
     log = RunLog(path, world="table", configuration=configuration, metadata={"versions": {"x": "1"}})

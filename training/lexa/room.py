@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from saccade.services.planner.lexa import ACTIONS, IMAGE_PX, SCALE, Actor, Policy, State, small
+from saccade.services.planner.lexa import ACTIONS, IMAGE_PX, SCALE, Actor, Policy, small
 from saccade.services.simulator.gym_env import ActiveSearch
 from saccade.services.simulator.scenes import room_scenes, save_scenes
 from saccade.shared.render.objects import load_mesh
@@ -60,9 +60,8 @@ class Living:
 
     @torch.no_grad()
     def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.float64]:
-        deterministic, _ = self.actor.model(self.state, self.action)
-        seen = self.actor.model.observe(deterministic, self.actor.encoder(small(image).to(self.device)))
-        self.state = State(deterministic, sampled(seen, self.generator))
+        self.state = self.actor.fold(self.state, self.action, small(image).to(self.device),
+                                     lambda posterior: sampled(posterior, self.generator))
         inputs = self.state.feature if self.goal is None else torch.cat([self.state.feature, self.goal], dim=-1)
         mean, std = self.policy(inputs)
         noise = torch.randn(mean.shape, generator=self.generator, device=self.device)

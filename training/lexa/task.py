@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from saccade.services.planner.lexa import EMBEDDED, State
+from saccade.services.planner.lexa import EMBEDDED, State, likeliest
 from saccade.training.lexa.behaviour import achiever_loss, explorer_loss
 from saccade.training.lexa.replay import Replay
 from saccade.training.lexa.room import Living, Room
@@ -103,7 +103,7 @@ class LexaTask:
         state, imagined = State(states.deterministic[:, 12], states.sample[:, 12]), []
         for n in range(13, SEQUENCE):
             kept, prior = learner.actor.model(state, batch.actions[:, n])
-            state = State(kept, torch.nn.functional.one_hot(prior.argmax(-1), prior.shape[-1]).float().flatten(1))
+            state = State(kept, likeliest(prior))
             imagined.append(learner.decoder(state.feature)[0])
         seen = learner.decoder(states.feature[0])
         draw_rows(path, [batch.images[0], seen, torch.cat([seen[:13], torch.stack(imagined)])])

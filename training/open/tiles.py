@@ -37,11 +37,6 @@ class Tiles:
     side_m: float
 
 
-def directions_of(count: int) -> NDArray[np.float64]:
-    """`count` unit vectors [N, 3], spread evenly over the sphere."""
-    return fibonacci_sphere(count)
-
-
 def random_light(rng: np.random.Generator) -> Look:
     """Light of any kind on an object alone."""
     lights = []
@@ -83,7 +78,7 @@ def _render(world: World, mesh: Mesh, count: int, variants: int, rng: np.random.
     side, half = crop_side_m(mesh.size_m), float(np.linalg.norm(mesh.size_m)) / 2
     images = np.empty((count, variants, TILE_PX, TILE_PX, 4), dtype=np.uint8)
     size = TILE_PX * FINER
-    for n, direction in enumerate(directions_of(count)):
+    for n, direction in enumerate(fibonacci_sphere(count)):
         range_m = half * rng.uniform(*RANGES)
         focal = size * range_m / side
         world.set_intrinsics((focal, focal, size / 2, size / 2))
@@ -115,7 +110,7 @@ def load_tiles(folder: Path, meshes: Sequence[Mesh]) -> Iterator[Tiles]:
         except (OSError, ValueError) as error:
             raise SaccadeError(f"views {path} are missing or damaged ({error}): remove the file, they are rendered "
                                "again") from error
-        yield Tiles(mesh.name, images, directions_of(len(images)), crop_side_m(mesh.size_m))
+        yield Tiles(mesh.name, images, fibonacci_sphere(len(images)), crop_side_m(mesh.size_m))
 
 
 def _path(folder: Path, name: str) -> Path:
