@@ -1,8 +1,9 @@
-"""`python -m saccade.benchmarks.soak [minutes [out.json]]` kills processes of runs at random, and counts what is lost.
+"""`python -m saccade.benchmarks.soak [kills [out.json]]` kills processes of runs at random, and counts what is lost.
 
-The runs follow one another. Every few seconds a process, chosen at random, is killed. The actions of each run must be
-those of the same run in one process, to the byte. The exit code is 1 if anything was lost, said twice or done
-otherwise.
+The runs follow one another until so many processes were killed (default: 200). Every few seconds it is the turn of one:
+the router, the recorder and the services all have theirs before one of them has its next. The actions of each run must
+be those of the same run in one process, to the byte. What `out.json` counted already counts on. The exit code is 1 if
+anything was lost, said twice or done otherwise.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 
 from rich.console import Console
@@ -27,12 +29,14 @@ from saccade.shared.bus.topics import ACTION, STATUS
 from saccade.shared.bus.wire import encode
 from saccade.shared.config import Config
 from saccade.shared.errors import SaccadeError
+from saccade.shared.log.provenance import commit
 from saccade.shared.log.reading import RunReader
 from saccade.shared.loop.local import run_local
 
-EVERY_S = (4.0, 10.0)  # between two kills
-EPISODES = 6
+EVERY_S = (1.0, 4.0)  # between two kills, if steps are done meanwhile
+EPISODES = 12  # of a run
 NAMES = ["soup_can", "rice_box"]
+KILLED = "killed: "
 FAULTS = ("lost episodes", "lost messages", "messages said twice", "runs with other actions")  # there should be none
 
 
@@ -49,7 +53,14 @@ def child(name: str) -> int | None:
     return None
 
 
-def soak(seed: int, folder: Path, counts: Counter, rng: random.Random) -> None:
+def victims(rng: random.Random) -> Iterator[str]:
+    """Yields the names of processes for ever, all of them in a new order in each round."""
+    names = [process.name for process in PROCESSES]
+    while True:
+        yield from rng.sample(names, len(names))
+
+
+def soak(seed: int, folder: Path, counts: Counter, rng: random.Random, turn: Iterator[str]) -> None:
     """Runs several episodes once, and adds to the counts."""
     config = Config().with_values({"seed": seed, "scene.names": NAMES, "scene.count": EPISODES})
     due_s = time.monotonic() + rng.uniform(*EVERY_S)
@@ -58,10 +69,10 @@ def soak(seed: int, folder: Path, counts: Counter, rng: random.Random) -> None:
         nonlocal due_s
         if topic == STATUS and time.monotonic() > due_s:
             due_s = time.monotonic() + rng.uniform(*EVERY_S)
-            name = rng.choice([process.name for process in PROCESSES])
+            name = next(turn)
             if (process := child(name)) is not None:
                 os.kill(process, signal.SIGKILL)
-                counts[f"killed: {name}"] += 1
+                counts[KILLED + name] += 1
 
     try:
         results = launch(config, folder / "run", kill, say=lambda text: None)
@@ -81,18 +92,26 @@ def soak(seed: int, folder: Path, counts: Counter, rng: random.Random) -> None:
     counts["runs with other actions"] += sorted(actions) != sorted(expected)
 
 
+def killed(counts: Counter[str]) -> int:
+    """How many processes were killed so far."""
+    return sum(count for name, count in counts.items() if name.startswith(KILLED))
+
+
 def main() -> None:
     """Prints a table. With a file's name it writes the numbers there after every run."""
-    minutes = float(sys.argv[1]) if len(sys.argv) > 1 else 30.0
-    counts: Counter[str] = Counter()
-    end_s, seed, rng = time.monotonic() + 60 * minutes, 0, random.Random(0)
+    kills = int(sys.argv[1]) if len(sys.argv) > 1 else 200
+    out = Path(sys.argv[2]) if len(sys.argv) > 2 else None
+    counts = Counter(json.loads(out.read_text())["counts"] if out is not None and out.is_file() else {})
+    rng = random.Random(counts["runs"])
+    turn = victims(rng)
     with Console().status("killing") as status:
-        while time.monotonic() < end_s:
+        while killed(counts) < kills:
             with tempfile.TemporaryDirectory() as folder:
-                soak(seed, Path(folder), counts, rng)
-            seed += 1
-            if len(sys.argv) > 2:
-                Path(sys.argv[2]).write_text(json.dumps(counts, indent=1, sort_keys=True) + "\n")
+                soak(counts["runs"], Path(folder), counts, rng, turn)
+            counts["runs"] += 1
+            if out is not None:
+                known = {"commit": commit(), "counts": counts}
+                out.write_text(json.dumps(known, indent=1, sort_keys=True) + "\n")
             status.update(", ".join(f"{name} {count}" for name, count in sorted(counts.items())))
     table = Table("what", "how many")
     for name, count in sorted(counts.items()):
