@@ -1,7 +1,8 @@
 """`python -m saccade.benchmarks.soak [kills [out.json]]` kills processes of runs at random, and counts what is lost.
 
-The runs follow one another until so many processes were killed (default: 200). Every few seconds it is the turn of one:
-the router, the recorder and the services all have theirs before one of them has its next. The actions of each run must
+The runs follow one another until so many processes were killed (default: 200). Every few seconds it is the turn of one,
+after a step; some are killed while another one is still coming back. The router, the recorder and the services all have
+their turn before one of them has its next. The actions of each run must
 be those of the same run in one process, to the byte. What `out.json` counted already counts on. The exit code is 1 if
 anything was lost, said twice or done otherwise.
 """
@@ -33,7 +34,8 @@ from saccade.shared.log.provenance import commit
 from saccade.shared.log.reading import RunReader
 from saccade.shared.loop.local import run_local
 
-EVERY_S = (1.0, 4.0)  # between two kills, if steps are done meanwhile
+EVERY_S = (0.3, 3.0)  # between two kills
+AGAIN = 0.25  # share of the kills that do not wait for a step to be done after the one before
 EPISODES = 12  # of a run
 NAMES = ["soup_can", "rice_box"]
 KILLED = "killed: "
@@ -63,12 +65,13 @@ def victims(rng: random.Random) -> Iterator[str]:
 def soak(seed: int, folder: Path, counts: Counter, rng: random.Random, turn: Iterator[str]) -> None:
     """Runs several episodes once, and adds to the counts."""
     config = Config().with_values({"seed": seed, "scene.names": NAMES, "scene.count": EPISODES})
-    due_s = time.monotonic() + rng.uniform(*EVERY_S)
+    due_s, heard = time.monotonic() + rng.uniform(*EVERY_S), {ACTION}
 
     def kill(topic, part, message) -> None:
-        nonlocal due_s
-        if topic == STATUS and time.monotonic() > due_s:
+        nonlocal due_s, heard
+        if topic in heard and time.monotonic() > due_s:
             due_s = time.monotonic() + rng.uniform(*EVERY_S)
+            heard = {ACTION, STATUS} if rng.random() < AGAIN else {ACTION}
             name = next(turn)
             if (process := child(name)) is not None:
                 os.kill(process, signal.SIGKILL)
