@@ -2,9 +2,9 @@
 
 The runs follow one another until so many processes were killed (default: 200). Every few seconds it is the turn of one,
 after a step; some are killed while another one is still coming back. The router, the recorder and the services all have
-their turn before one of them has its next. The actions of each run must
-be those of the same run in one process, to the byte. What `out.json` counted already counts on. The exit code is 1 if
-anything was lost, said twice or done otherwise.
+their turn before one of them has its next. The actions of each run must be those of the same run in one process, to the
+byte. What `out.json` counted already counts on, and a run in which something was lost is kept in a folder beside it.
+The exit code is 1 if anything was lost, said twice or done otherwise.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from __future__ import annotations
 import json
 import os
 import random
+import shutil
 import signal
 import sys
 import tempfile
@@ -109,8 +110,11 @@ def main() -> None:
     turn = victims(rng)
     with Console().status("killing") as status:
         while killed(counts) < kills:
+            faults = [counts[name] for name in FAULTS]
             with tempfile.TemporaryDirectory() as folder:
                 soak(counts["runs"], Path(folder), counts, rng, turn)
+                if out is not None and faults != [counts[name] for name in FAULTS]:
+                    shutil.copytree(folder, out.with_suffix("") / str(counts["runs"]), dirs_exist_ok=True)
             counts["runs"] += 1
             if out is not None:
                 known = {"commit": commit(), "counts": counts}

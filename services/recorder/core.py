@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import math
 import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
 
+from saccade.services.recorder.whole import Whole
 from saccade.shared.bus.messages import Message, Status
 from saccade.shared.bus.outbox import KEPT_BYTES
 from saccade.shared.bus.sequences import Key, Sequences
@@ -25,13 +27,14 @@ from saccade.shared.log.folder import LOG_NAME
 from saccade.shared.log.provenance import describe
 from saccade.shared.log.reading import RunReader
 from saccade.shared.log.recording import AWAITED, FINISHED, FLUSH_S, RecordingStopped, RunLog
-from saccade.shared.loop.episodes import stranger
+from saccade.shared.loop.episodes import NOT_RECORDING, RECORDER, stranger
 from saccade.shared.loop.process import Health, Heartbeat, Inbox, Item, run_process
 
-NAME = "recorder"
+NAME = RECORDER
 QUEUE_BYTES = 512 * 1024 * 1024
 ASKED_AGAIN_S = 0.5  # time until missing messages are asked for again; it doubles with every attempt
 MOST_INVALID_BYTES = 64 * 1024 * 1024  # of payloads that are not valid messages and are recorded all the same
+GIVEN_UP_S = 15.0  # time until the next episode may begin although one lacks messages
 QUIET_S = 1.5  # after this time without a new message the publishers are asked for their latest ones
 
 
@@ -77,6 +80,8 @@ class Recorder:
         self._follows_source = bool(config.bus.wait_for)  # what a replay plays may begin and go on anywhere
         self._episode = 0  # the episode that the source is in
         self._asked_s, self._ask_again_s, self._news_s = 0.0, ASKED_AGAIN_S, time.monotonic()
+        self._whole = Whole(self._run, {n for n in config.bus.wait_for if n != NAME} if self._awaited(config) else None)
+        self._over_s = math.inf  # since when the episode that is recorded now is over
         self.log = self._open(folder / LOG_NAME, config)
 
     def record(self, inbox: Inbox) -> Health:
@@ -95,7 +100,7 @@ class Recorder:
                     work()
                 except RecordingStopped as error:
                     stopped = error
-                    health.say("not recording", str(error))
+                    health.say(NOT_RECORDING, str(error))
         if stopped is not None:
             raise stopped
         return health
@@ -106,6 +111,7 @@ class Recorder:
             self._take(*item)
         else:
             self.log.flush_if_due()
+        self._tell_whole()
         if item is not None and item[0].in_step:
             self._news_s = time.monotonic()
         elif time.monotonic() - self._news_s >= QUIET_S:
@@ -120,9 +126,8 @@ class Recorder:
             path.rename(before)
         path.unlink(missing_ok=True)
         try:
-            awaited = NAME in config.bus.wait_for and not config.bus.live  # the run of a live camera ends at any time
             log = RunLog(path, world=config.bus.world, configuration=config.model_dump_json(indent=2),
-                         metadata=describe(config, self._run) | (to_be_finished() if awaited else {}))
+                         metadata=describe(config, self._run) | (to_be_finished() if self._awaited(config) else {}))
             if before.exists():
                 self._copy(before, log)
                 before.unlink()
@@ -131,6 +136,11 @@ class Recorder:
             if before.exists():  # so that nothing that was recorded is lost
                 before.replace(path)
             raise
+
+    @staticmethod
+    def _awaited(config: Config) -> bool:
+        """Whether a source waits for this recorder. The run of a live camera ends at any time."""
+        return NAME in config.bus.wait_for and not config.bus.live
 
     def _copy(self, before: Path, log: RunLog) -> None:
         """Copies what the recorder had written before it was killed. Raises SaccadeError if it is of another run."""
@@ -159,6 +169,21 @@ class Recorder:
         self._ask_for_missing()
         if topic == RESULT and is_own and message is not None:
             self._ask_for_held(message.episode)
+
+    def _tell_whole(self) -> None:
+        """Says in its status which episode comes next, once everything of the one before is in the log. The source
+        waits for this, so that no service forgets an episode that the log lacks a part of."""
+        due = None
+        while self._whole.is_over:
+            self._over_s = min(self._over_s, time.monotonic())
+            lacks = not self._whole.is_whole or self._sequences.lacks(self._run, self._whole.episode)
+            if lacks and time.monotonic() - self._over_s < GIVEN_UP_S:
+                break
+            due, self._over_s = self._whole.next(), math.inf
+        if due is not None:
+            self.log.flush()
+            self.health.at = (self._run, due, 0)
+            self.health.changed.set()
 
     def _ask_for_news(self) -> None:
         """Asks for the newest messages. If the newest is lost, there is no later one whose number would show this."""
@@ -223,6 +248,7 @@ class Recorder:
                 self.health.refuse(topic, part and printable(part, NAME_LIMIT), f"{reason}, and is not recorded")
                 return
             self._follow(log, topic, part, message)
+            self._whole.take(topic, part, message)
             if (lost := self._sequences.take(topic, part, message)) is None:
                 return
             if lost and time_ns is None:  # the missing ones come first, so that the log is in order

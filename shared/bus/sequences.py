@@ -114,6 +114,10 @@ class Sequences:
         counts = {key: sum(missing.count for missing in episodes.values()) for key, episodes in self._missing.items()}
         return {key: count for key, count in counts.items() if count}
 
+    def lacks(self, run: str, episode: int) -> bool:
+        """Whether a message of that episode has not arrived although a later one of its key has."""
+        return any(episodes[run, episode].count for episodes in self._missing.values() if (run, episode) in episodes)
+
     @property
     def first_missing(self) -> int:
         """The first episode in which a message is missing. It is 0 if nothing is missing."""

@@ -9,25 +9,31 @@ from saccade.shared.bus.wire import MessageError
 from saccade.shared.errors import told
 
 READY_STATES = ("ready", "busy")
+RECORDER, NOT_RECORDING = "recorder", "not recording"
+ENDED = (NOT_RECORDING, "stopped", "failed")  # of a recorder: no log is waited for any more
 
 
 class Episodes:
     """Knows which episode a source begins next.
 
     The first one begins when every service in `wait_for` (`awaited`) is ready. If the episodes are `closed` by others,
-    each later one begins when the one before it is closed. The episodes of a source that is `timed` cannot be repeated.
-    A service that is no source has none, and waits for nobody.
+    each later one begins when the one before it is closed, and recorded if a recorder is waited for. So nothing is lost
+    with a service that is killed: the others repeat the episode that they are in, and all before it is in the log. The
+    episodes of a source that is `timed` cannot be repeated. A service that is no source has none, and waits for nobody.
     """
 
     def __init__(self, count: int, run: str, wait_for: Iterable[str] = (), *, closed: bool, timed: bool) -> None:
         self.awaited = set(wait_for)
         self._count, self._end, self._next, self._over = count, count, 0, -1
         self._run, self._closed, self._past = run, closed, int(timed)
+        self._recorder = RECORDER in self.awaited and closed
+        self._recorded = -1  # the last episode of which the recorder said that all is in the log
 
     @property
     def may_begin(self) -> bool:
         """Whether everything is there for the next episode."""
-        return not self.awaited and (not self._closed or self._over >= self._next - 1)
+        return (not self.awaited and (not self._closed or self._over >= self._next - 1)
+                and (not self._recorder or self._recorded >= self._next - 1))
 
     @property
     def current(self) -> int:
@@ -52,12 +58,20 @@ class Episodes:
         self._over = max(self._over, message.episode)
 
     def heard(self, part: str | None, status: Status) -> bool:
-        """Takes a status. Returns whether it was the last one that was awaited."""
+        """Takes a status. Returns whether it was the last one that was awaited, or lets the next episode begin."""
+        waited = not self.may_begin
+        if part == RECORDER and status.state in ENDED:
+            self._recorder = False
+        elif part == RECORDER and status.run == self._run:
+            self._recorded = max(self._recorded, status.episode - 1)
+        if not self.awaited:
+            return waited and self.may_begin
         if part not in self.awaited or status.state not in READY_STATES:
             return False
         self.awaited.discard(part)
         if status.run == self._run:  # this source was started again: the others are in that episode already
-            self._next = max(self._next, status.episode + self._past)
+            in_it = status.episode + self._past if self._past else min(status.episode, self._count - 1)
+            self._next = max(self._next, in_it)
             self._over = self._next - 1
             self._end = self._count + self._past * self._next
         return not self.awaited

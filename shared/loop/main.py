@@ -17,7 +17,7 @@ from saccade.shared.bus.transport import Bus, ZenohBus
 from saccade.shared.bus.wire import MessageError, decode, encode, stamp_of
 from saccade.shared.config import Config
 from saccade.shared.errors import SaccadeError
-from saccade.shared.loop.episodes import Episodes, stranger
+from saccade.shared.loop.episodes import RECORDER, Episodes, stranger
 from saccade.shared.loop.modules import ServiceModule, load
 from saccade.shared.loop.process import DRAIN_S, Health, Heartbeat, Inbox, run_process
 from saccade.shared.loop.replicas import JOIN_S, MEET_S, Share, alone_on
@@ -72,7 +72,7 @@ def serve(service: Service, core: Core, bus: Bus, parts: tuple[str, ...], *, run
     stepper = Stepper(service, core, parts, source=source, live=live, first_step=first_step, run=run)
     loop = _Loop(stepper, bus, run, wait_for if source else (), live=live)
     bus.answer(service.outputs, loop.outbox.answer)
-    bus.subscribe(loop.topics + ((STATUS,) if loop.awaited else ()) + loop.watched, inbox.put)
+    bus.subscribe(loop.topics + ((STATUS,) if source and wait_for else ()) + loop.watched, inbox.put)
     loop.join(inbox)
     with Heartbeat(bus, loop.health, inbox.stop):
         loop.health.say("ready", WAITS + ", ".join(sorted(loop.awaited)) if loop.awaited else loop.notes)
@@ -245,7 +245,8 @@ class _Loop:
             self.health.say(note=WAITS + ", ".join(lacks))
 
     def _note_status(self, part: str | None, payload: bytes) -> None:
-        if not self.awaited:
+        awaited = bool(self.awaited)
+        if not awaited and part != RECORDER:
             return
         try:
             status = decode(STATUS.type, payload)
@@ -254,9 +255,11 @@ class _Loop:
         if (reason := stranger(status, part, self._run)) is not None:
             self._refuse(STATUS, part, reason)
         elif self._episodes.heard(part, status):
-            self.health.say(note=self.notes)
+            if awaited:
+                self.health.say(note=self.notes)
             self.begin_if_due()
-            self.catch_up()
+            if awaited:
+                self.catch_up()
 
     def _step(self, topic: Topic | None, part: str | None, make: Callable[[], list[Output] | None]) -> bool:
         """Runs the core once and publishes its outputs. Returns whether there was anything to do."""

@@ -147,6 +147,7 @@ class Heartbeat:
         self._bus, self._health, self._on_orphaned = bus, health, on_orphaned
         self._stop = threading.Event()
         self._seq = 0
+        health.changed.set()  # it tells the first state at once
         self._parent, self._file = os.environ.get(LAUNCHER_VARIABLE), os.environ.get(HEARTBEAT_VARIABLE)
         self._thread = threading.Thread(target=self._run, name="heartbeat", daemon=True)
 
@@ -163,9 +164,9 @@ class Heartbeat:
 
     def _run(self) -> None:
         while not self._stop.wait(SHORTEST_S):
-            self._publish()
             self._health.changed.wait(HEARTBEAT_S)
             self._health.changed.clear()
+            self._publish()
             if self._parent is not None and str(os.getppid()) != self._parent:
                 self._on_orphaned()
 
