@@ -69,3 +69,10 @@ def draw_poses(path: Path, batch: RenderedBatch, labels: Tensor) -> None:
     size = batch.input.shape[-2:]
     shown = [_LABEL_COLOURS[label.cpu()].permute(0, 3, 1, 2) for label in (batch.label, labels.argmax(1))]
     draw_rows(path, [batch.input[:, :3], *(F.interpolate(row, size=size) for row in shown)])
+
+
+def draw_pairs(path: Path, seen: Tensor, known: Tensor) -> None:
+    """Saves crops [B, 4, 64, 64] over their masks over known views [B, 4, 64, 64]."""
+    rows = torch.cat([seen[:, :3], seen[:, 3:].expand(-1, 3, -1, -1), known[:, :3]], dim=2)
+    image = torch.cat(list(rows), dim=2).clamp(0, 1).permute(1, 2, 0)
+    Image.fromarray((image * 255).byte().cpu().numpy()).save(path)

@@ -146,6 +146,17 @@ def fibonacci_sphere(count: int) -> Array:
     return direction(azimuth, np.arcsin(2.0 * np.sin(elevation) - 1.0))
 
 
+def circle_around(points: ArrayLike, rounds: int = 60) -> tuple[Array, float]:
+    """About the smallest circle around points [N, 2]: its centre [2] and its radius. Each round moves the centre a
+    smaller share of the way to the farthest point (Badoiu and Clarkson, 2003)."""
+    points = np.asarray(points, dtype=np.float64)
+    center = (points.min(0) + points.max(0)) / 2
+    for k in range(rounds):
+        far = points[np.argmax(((points - center) ** 2).sum(1))]
+        center = center + (far - center) / (k + 3)
+    return center, float(np.sqrt(((points - center) ** 2).sum(1).max()))
+
+
 GRID_ELEVATIONS, GRID_AZIMUTHS = 18, 72  # cells of 5 degrees
 
 

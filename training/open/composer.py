@@ -1,6 +1,7 @@
 """Crops as a proposer cuts them: an object in any light, on any surface, between others, a little off.
 
-Beside each crop stands the view that a bank has of the object from the same direction.
+Beside each crop stands the view that a bank has of the object from the same direction. In both, the circle around the
+object's whole outline fills the share FILLED of the picture, but for what the crop is off.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from saccade.services.perception.bank import FILLED
 from saccade.shared.render.surfaces import SURFACES
 from saccade.shared.world.windows import CROP_PX
 from saccade.training.crops import warp
@@ -20,6 +22,7 @@ from saccade.training.open.tiles import Tiles
 BACKGROUNDS = 160  # surfaces that are made once
 SCALE, SHIFT, ROLL_RAD = 0.17, 0.10, 0.15  # how wrong a proposal is: log of its side, place in sides, roll
 BESIDE, BEFORE = 0.6, 0.35  # shares of crops with a neighbour behind or beside, and before
+AS_IT_IS = 0.6  # share of the images that a camera which acts gently leaves
 SMALL = 0.35  # share of crops that come from few pixels
 
 
@@ -29,7 +32,8 @@ class Crops:
 
     seen [B, 4, 64, 64] is the crop with its mask (the last channel), known [B, 4, 64, 64] the flat view from the same
     direction; object [B] are numbers, direction [B, 3] point from the object to the camera; visible [B] is the share of
-    the object that nothing hides.
+    the object that nothing hides. What the crop is off by [B, 4]: where the object's circle lies (right, down, in half
+    sides), the log of how much larger it is, and the roll (rad).
     """
 
     seen: Tensor
@@ -37,6 +41,7 @@ class Crops:
     object: Tensor
     direction: Tensor
     visible: Tensor
+    off: Tensor
 
 
 class CropMaker:
@@ -50,6 +55,23 @@ class CropMaker:
         surfaces = np.stack([makers[n % len(makers)](rng)[::2, ::2] for n in range(BACKGROUNDS)])
         self.surfaces = torch.from_numpy(surfaces).permute(0, 3, 1, 2).to(device)
         self.directions = [torch.tensor(t.directions, dtype=torch.float32) for t in tiles]
+
+    def known(self, which: np.ndarray, index: np.ndarray) -> Tensor:
+        """The views [B, 4, 64, 64] that banks have: flat, with the outline's circle in the middle."""
+        still = torch.zeros(len(which), device=self.device)
+        return self._placed(self.tile(which, index, np.zeros(len(which), dtype=int)), which, index,
+                            torch.stack([still, still], 1), still + 1, still)
+
+    def _placed(self, tiles: Tensor, which: np.ndarray, index: np.ndarray, shift: Tensor, scale: Tensor,
+                roll: Tensor) -> Tensor:
+        """Tiles drawn so that the circle around the outline has the centre `shift` [B, 2] and is `scale` [B] times
+        as large as in a bank, turned by `roll` [B]."""
+        circles = np.stack([self.tiles[o].circles[n] for o, n in zip(which, index, strict=True)])
+        circle = torch.tensor(circles, dtype=torch.float32, device=self.device)
+        size = scale * FILLED / circle[:, 2]
+        cos, sin = size * roll.cos(), size * roll.sin()
+        center = torch.stack([cos * circle[:, 0] - sin * circle[:, 1], sin * circle[:, 0] + cos * circle[:, 1]], 1)
+        return warp(tiles, shift - center, size, roll)
 
     def tile(self, which: np.ndarray, index: np.ndarray, variant: np.ndarray) -> Tensor:
         """Tiles [B, 4, 80, 80] from 0 to 1."""
@@ -68,7 +90,7 @@ class CropMaker:
         mine = self.tile(which, index, variants)
         scale = ((uniform(count) * 2 - 1) * SCALE).exp()
         shift, roll = (uniform(count, 2) * 2 - 1) * 2 * SHIFT, (uniform(count) * 2 - 1) * ROLL_RAD
-        whole = warp(mine, shift, scale, roll)
+        whole = self._placed(mine, which, index, shift, scale, roll)
         image = self._background(count, uniform)
         image = self._over(image, self._neighbour(which, rng, uniform) * (uniform(count) < BESIDE)[:, None, None, None])
         image = self._shadowed(image, whole[:, 3:], uniform)
@@ -76,13 +98,13 @@ class CropMaker:
         before = self._neighbour(which, rng, uniform, away=0.75) * (uniform(count) < BEFORE)[:, None, None, None]
         image, alpha = self._over(image, before), alpha * (1 - before[:, 3:])
         visible = alpha.sum((1, 2, 3)) / whole[:, 3].sum((1, 2)).clamp(min=1.0)
-        mask = self._found(alpha, before[:, 3:], uniform)
-        image = self._camera(image, uniform)
-        flat = self.tile(which, index, np.zeros(count, dtype=int))
-        known = F.interpolate(flat, size=(CROP_PX, CROP_PX), mode="area")
+        mask = self.found(alpha, before[:, 3:], uniform)
+        image = self.camera(image, uniform)
+        known = self.known(which, index)
         direction = torch.stack([self.directions[o][n] for o, n in zip(which, index, strict=True)]).to(self.device)
+        off = torch.cat([shift, scale.log()[:, None], roll[:, None]], dim=1)
         return Crops(torch.cat([image, mask], dim=1), known, torch.as_tensor(which, device=self.device), direction,
-                     visible)
+                     visible, off)
 
     @staticmethod
     def _over(below: Tensor, layer: Tensor) -> Tensor:
@@ -118,7 +140,7 @@ class CropMaker:
         soft = F.avg_pool2d(moved, 7, 1, 3)
         return image * (1 - soft * (uniform(count) * 0.6)[:, None, None, None])
 
-    def _found(self, alpha: Tensor, before: Tensor, uniform) -> Tensor:
+    def found(self, alpha: Tensor, before: Tensor, uniform) -> Tensor:
         """A mask as a proposer finds it: soft, grown or shrunk, bitten, and leaking into what stands before it."""
         count = len(alpha)
         pick = uniform(count)[:, None, None, None]
@@ -129,9 +151,9 @@ class CropMaker:
         mask = (mask + before * leak).clamp(0, 1) * (1 - bite)
         return F.avg_pool2d(mask, 3, 1, 1)
 
-    def _camera(self, image: Tensor, uniform) -> Tensor:
-        """Exposure, colours, gamma, few pixels, blur and noise."""
-        count = len(image)
+    def camera(self, image: Tensor, uniform, gently: bool = False) -> Tensor:
+        """Exposure, colours, gamma, few pixels, blur and noise. `gently` leaves some of the images as they are."""
+        count, before = len(image), image
 
         def each(low: float, high: float) -> Tensor:
             return (low + (high - low) * uniform(count))[:, None, None, None]
@@ -143,4 +165,5 @@ class CropMaker:
         pick = uniform(count)[:, None, None, None]
         image = torch.where(pick < SMALL / 3, coarse, torch.where(pick < SMALL, half, image))
         noise = (uniform(*image.shape) - 0.5) * 12 ** 0.5
-        return (image + noise * each(0, 0.04)).clamp(0, 1)
+        image = (image + noise * each(0, 0.04)).clamp(0, 1)
+        return torch.where((uniform(count) < AS_IT_IS)[:, None, None, None], before, image) if gently else image

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from saccade.shared.render.look import random_look
+from saccade.shared.render.look import FLAT, random_look
 from saccade.shared.render.mesh import Mesh
 from saccade.shared.render.world import World
 from saccade.shared.world.geometry import IMAGE_SIZE_PX, INTRINSICS_PX, direction, look_at, rotation_xyz
@@ -15,6 +15,7 @@ from saccade.shared.world.geometry import IMAGE_SIZE_PX, INTRINSICS_PX, directio
 FRAME_PX = 256
 MOST = 9  # objects on a table
 LYING = 0.35  # share of the objects that do not stand as they should
+PLAIN = 0.15  # share of the tables in the flat look
 QUARTERS = np.pi / 2 * np.arange(4)
 
 Array = NDArray[np.float64]
@@ -55,7 +56,7 @@ def _render(world: World, tables: Tables, n: int, rng: np.random.Generator) -> N
     chosen = rng.permutation(len(tables.names))[:1 + min(int(rng.geometric(0.25)) - 1, MOST - 1)]
     poses = _placed([world.meshes[tables.names[k]] for k in chosen], rng)
     camera = _camera(poses, rng)
-    look = random_look(rng)
+    look = FLAT if rng.random() < PLAIN else random_look(rng)
     world.set_look(look)
     named = {tables.names[k]: pose for k, pose in zip(chosen, poses, strict=True)}
     table_rgb = rng.random(3) * 255

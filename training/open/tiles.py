@@ -16,7 +16,7 @@ from saccade.shared.render.look import FLAT, Light, Look
 from saccade.shared.render.mesh import Mesh
 from saccade.shared.render.views import crop_side_m
 from saccade.shared.render.world import World
-from saccade.shared.world.geometry import fibonacci_sphere, look_at
+from saccade.shared.world.geometry import circle_around, fibonacci_sphere, look_at
 
 TILE_PX, FINER = 80, 2  # side of a tile; it is rendered finer and averaged
 RANGES = (2.5, 5.0)  # of the camera, in units of the half diagonal of the object's box
@@ -28,13 +28,15 @@ class Tiles:
     """Views of one object: images [N, V, 80, 80, 4] uint8 (RGB, premultiplied by the coverage, and the coverage).
 
     The first of the V variants is flat, the others are lit. directions [N, 3] point from the object to the camera, in
-    the object's frame. A tile covers `side_m` metres at the object's centre.
+    the object's frame. A tile covers `side_m` metres at the object's centre. `circles` [N, 3] are the smallest circles
+    around the object's outline: centre (right, down) and radius, in half sides of the tile.
     """
 
     name: str
     images: NDArray[np.uint8]
     directions: NDArray[np.float64]
     side_m: float
+    circles: NDArray[np.float64]
 
 
 def random_light(rng: np.random.Generator) -> Look:
@@ -98,6 +100,21 @@ def _finer(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return ((blocks + FINER ** 2 // 2) // FINER ** 2).astype(np.uint8)
 
 
+def circles_of(coverage: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """The circles [N, 3] around outlines with this coverage [N, S, S], see `Tiles`. An empty one has the whole tile."""
+    size, circles = coverage.shape[-1], []
+    for shown in coverage > 127:
+        rows = np.flatnonzero(shown.any(1))
+        if not len(rows):
+            circles.append((0.0, 0.0, 1.0))
+            continue
+        first, last = shown.argmax(1)[rows], size - shown[:, ::-1].argmax(1)[rows]  # the ends of each row
+        corners = [np.stack([x, y], 1) for x in (first, last) for y in (rows, rows + 1)]
+        center, radius = circle_around(2 * np.concatenate(corners) / size - 1)
+        circles.append((*center, radius))
+    return np.array(circles)
+
+
 def load_tiles(folder: Path, meshes: Sequence[Mesh]) -> Iterator[Tiles]:
     """Opens the tiles of these objects; they are read where they are used. Raises SaccadeError if one is missing or
     damaged."""
@@ -110,7 +127,8 @@ def load_tiles(folder: Path, meshes: Sequence[Mesh]) -> Iterator[Tiles]:
         except (OSError, ValueError) as error:
             raise SaccadeError(f"views {path} are missing or damaged ({error}): remove the file, they are rendered "
                                "again") from error
-        yield Tiles(mesh.name, images, fibonacci_sphere(len(images)), crop_side_m(mesh.size_m))
+        yield Tiles(mesh.name, images, fibonacci_sphere(len(images)), crop_side_m(mesh.size_m),
+                    circles_of(images[:, 0, ..., 3]))
 
 
 def _path(folder: Path, name: str) -> Path:

@@ -1,0 +1,121 @@
+"""Trains the view encoder: views that are near on the sphere around an object come near to each other, however they are
+lit, hidden or cut out; views of different objects come apart."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from saccade.services.perception.view_encoder import ViewEncoder
+from saccade.training.open.composer import Crops
+from saccade.training.open.material import Material
+from saccade.training.pictures import draw_pairs
+from saccade.training.settings import TrainingConfig
+from saccade.training.tasks import on_device
+
+NEAR_RAD = 0.13  # two views of one object count as the same by exp(-(angle / this)^2)
+PER_OBJECT = 4  # crops of one object in a batch: two that are near each other, and others
+COMPOSED = 0.6  # share of the crops that are composed; the others are cut out of rendered tables
+REAL = 0.5  # share of the composed crops that show scanned objects, not groceries made by code
+SEEN = 0.25  # a crop counts if so much of its object is seen
+EVALUATED = 600  # crops in an evaluation
+
+
+class EncoderTask:
+    """Trains the view encoder with soft targets in both directions, from crops to known views and back."""
+
+    def __init__(self, config: TrainingConfig, material: Material, device: torch.device):
+        torch.manual_seed(config.seed)
+        self.config, self.material, self.device = config, material, device
+        self.encoder = on_device(ViewEncoder(), device)
+        self.lambdas: list[float] = []
+
+    @property
+    def module(self) -> ViewEncoder:
+        """The networks."""
+        return self.encoder
+
+    def loss(self, step: int) -> tuple[Tensor, dict[str, float]]:
+        """The loss at a step, and its parts."""
+        rng = np.random.default_rng([self.config.seed, 1, step])
+        crops = batch(self.material, self.config.batch_extraction, rng)
+        with torch.autocast(self.device.type, dtype=torch.bfloat16):
+            seen, known = self.encoder(crops.seen), self.encoder(crops.known)
+        return contrast(seen, known, crops, self.encoder.log_sharpness.exp())
+
+    def after(self, step: int, smoothed: dict[str, float]) -> None:
+        """Does nothing, because this task has no weights that adapt."""
+
+    @torch.inference_mode()
+    def evaluate(self) -> dict[str, float]:
+        """How often crops of held-out tables are named right among all scanned objects, and how far the direction is
+        off (rad)."""
+        material, rng = self.material, np.random.default_rng([self.config.seed, 2 ** 31])
+        vectors, owner, directions = banks_of(self.encoder, material)
+        named, turned = [], []
+        chosen = rng.choice(len(material.held_out.sights.table), EVALUATED)
+        for part in np.split(chosen, 6):
+            crops = material.held_out.draw(part, rng)
+            similar = self.encoder(crops.seen) @ vectors.T
+            named.append(owner[similar.argmax(1)] == crops.object)
+            mine = torch.where(owner == crops.object[:, None], similar, torch.tensor(-9.0))
+            turned.append((directions[mine.argmax(1)] * crops.direction).sum(1).clamp(-1, 1).arccos())
+        right, angle = torch.cat(named).float(), torch.cat(turned)
+        new = torch.tensor(np.isin(material.held_out.sights.object[chosen], material.held_numbers))
+        return {"named": float(right[~new].mean()), "named_new": float(right[new].mean()),
+                "turn_rad": float(angle.median()), "turn_within_0.2": float((angle < 0.2).float().mean()),
+                "turn_within_0.5": float((angle < 0.5).float().mean())}
+
+    def draw(self, path: Path) -> None:
+        """Saves sample pictures: crops, and the known views from about there."""
+        crops = batch(self.material, 16, np.random.default_rng([self.config.seed, 2 ** 31]))
+        draw_pairs(path, crops.seen, crops.known)
+
+
+def batch(material: Material, count: int, rng: np.random.Generator) -> Crops:
+    """About `count` crops of a few objects each, composed and cut out of tables."""
+    which, index = [], []
+    for _ in range(round(count * COMPOSED / PER_OBJECT)):
+        number = material.drawn(rng, REAL)
+        directions = material.tiles[number].directions
+        first = int(rng.integers(len(directions)))
+        near = np.argsort(-(directions @ directions[first]))[1:1 + max(2, len(directions) // 50)]
+        others = rng.integers(len(directions), size=PER_OBJECT - 2)
+        which += [number] * PER_OBJECT
+        index += [first, int(rng.choice(near)), *map(int, others)]
+    composed = material.composed.draw(np.array(which), np.array(index), rng)
+    tables = material.tables.draw(rng.integers(len(material.tables.sights.table), size=count - len(which)), rng)
+    return Crops(*(torch.cat(pair) for pair in zip(vars(composed).values(), vars(tables).values(), strict=True)))
+
+
+def contrast(seen: Tensor, known: Tensor, crops: Crops, sharpness: Tensor) -> tuple[Tensor, dict[str, float]]:
+    """The cross entropy between similarities of vectors and what they should be, from crops to views and back."""
+    angle = (crops.direction @ crops.direction.T).clamp(-1 + 1e-6, 1 - 1e-6).arccos()
+    same = crops.object[:, None] == crops.object[None]
+    target = torch.where(same, torch.exp(-(angle / NEAR_RAD) ** 2), torch.zeros(()))
+    target.fill_diagonal_(1.0)
+    logits = sharpness * (seen @ known.T)
+    weight = (crops.visible > SEEN).float()
+    there = -(target / target.sum(1, keepdim=True) * logits.log_softmax(1)).sum(1)
+    back = -(target.T / target.T.sum(1, keepdim=True) * logits.T.log_softmax(1)).sum(1)
+    loss = ((there + back) * weight).sum() / weight.sum().clamp(min=1.0)
+    right = (same.gather(1, logits.argmax(1, keepdim=True))[:, 0].float() * weight).sum() / weight.sum()
+    return loss, {"contrast": float(loss.detach()), "named": float(right)}
+
+
+@torch.inference_mode()
+def banks_of(encoder: ViewEncoder, material: Material) -> tuple[Tensor, Tensor, Tensor]:
+    """The encoded views of all scanned objects: vectors [V, D], the objects' numbers [V], directions [V, 3]."""
+    vectors, owner, directions = [], [], []
+    for number in material.real:
+        tiles = material.tiles[number]
+        every: NDArray[np.int64] = np.arange(len(tiles.directions))
+        for part in np.array_split(every, max(1, len(every) // 100)):
+            vectors.append(encoder(material.composed.known(np.full(len(part), number), part)))
+        owner.append(torch.full((len(every),), number))
+        directions.append(torch.tensor(tiles.directions, dtype=torch.float32))
+    return torch.cat(vectors), torch.cat(owner), torch.cat(directions)
