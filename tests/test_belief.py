@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from saccade.services.belief.pose import GoalView
+from saccade.services.belief.pose import GoalView, LatentLikeness
 from saccade.services.belief.position import PositionFilter, behind, beyond_nearest, evidence_of
 from saccade.shared.bus.messages import Percept
 from saccade.shared.config import BeliefConfig
@@ -95,7 +95,7 @@ def test_the_papers_covariance_is_fixed():
 
 
 def test_the_last_view_alone_forgets_the_others():
-    seen = GoalView(BeliefConfig(pose="last"), Turning(1), percept(start_pose(), latent=latent_of(1.0, 0.5)))
+    seen = goal_view(Turning(1), latent_of(1.0, 0.5), BeliefConfig(pose="last"))
     for camera in cameras():
         seen.seen(percept(camera, latent=latent_of(0.3, 0.7)), TRUE)
     assert len(seen.keyframes) == 1
@@ -136,6 +136,12 @@ class Turning:
         return moved, np.full_like(moved, 0.15)
 
 
+def goal_view(transition, latent, config=CONFIG):
+    """What is known of a goal image that shows the object with this latent pose, before the first view."""
+    goal = percept(start_pose(), latent=latent)
+    return GoalView(config, LatentLikeness(transition, goal), goal)
+
+
 def latent_of(azimuth, elevation, folds=1):
     return np.array([np.cos(folds * azimuth), np.sin(folds * azimuth), elevation, 0, 0, 0, 0, 0])
 
@@ -143,7 +149,7 @@ def latent_of(azimuth, elevation, folds=1):
 @pytest.mark.parametrize("goal", [(2.5, 0.6), (-3.1, 1.0), (0.2, 0.1)])
 def test_the_goals_direction_is_found_from_other_views(goal):
     """Two views of an object without symmetry: the posterior's peak is within a cell or two of the goal's direction."""
-    seen = GoalView(CONFIG, Turning(1), percept(start_pose(), latent=latent_of(*goal)))
+    seen = goal_view(Turning(1), latent_of(*goal))
     assert seen.log_posterior() is None
     for camera in (cameras()[0], cameras()[-1]):
         azimuth, elevation, _ = spherical(camera[:3, 3], TRUE)
@@ -157,7 +163,7 @@ def test_the_goals_direction_is_found_from_other_views(goal):
 
 def test_a_symmetric_object_keeps_two_modes():
     """Front and back look the same: both directions keep about the same probability."""
-    seen = GoalView(CONFIG, Turning(2), percept(start_pose(), latent=latent_of(1.0, 0.5, 2)))
+    seen = goal_view(Turning(2), latent_of(1.0, 0.5, 2))
     for camera in cameras():
         azimuth, elevation, _ = spherical(camera[:3, 3], TRUE)
         seen.seen(percept(camera, latent=latent_of(azimuth, elevation, 2)), TRUE)
@@ -170,7 +176,7 @@ def test_a_symmetric_object_keeps_two_modes():
 
 
 def test_views_from_the_same_place_count_once():
-    seen = GoalView(CONFIG, Turning(1), percept(start_pose(), latent=latent_of(1.0, 0.5)))
+    seen = goal_view(Turning(1), latent_of(1.0, 0.5))
     for _ in range(5):
         seen.seen(percept(cameras()[0], latent=latent_of(0.0, 0.7)), TRUE)
     assert len(seen.keyframes) == 1

@@ -26,7 +26,8 @@ from saccade.shared.log.recording import RunLog
 from saccade.tests.fixtures.make import CONFIG, GOLDEN, IN_WORDS, WORDS, changes, in_words
 from saccade.tests.samples import sample
 
-FORMAT_1, FORMAT_2, FORMAT_3 = (GOLDEN.with_name(f"format_{number}.mcap") for number in (1, 2, 3))
+FORMAT_1, FORMAT_2, FORMAT_3, FORMAT_4 = OLDER = tuple(
+    GOLDEN.with_name(f"format_{number}.mcap") for number in (1, 2, 3, 4))
 WAIT_S = 300
 
 
@@ -70,14 +71,15 @@ def test_the_oldest_format_still_replays_to_the_byte(tmp_path):
 
 
 def test_the_golden_log_has_the_present_format_and_each_older_one_has_a_log():
-    readers = [RunReader(log) for log in (FORMAT_1, FORMAT_2, FORMAT_3, GOLDEN)]
+    readers = [RunReader(log) for log in (*OLDER, GOLDEN)]
     assert all(list(reader) for reader in readers)
     assert [reader.format for reader in readers] == list(range(OLDEST, FORMAT + 1))
 
 
-@pytest.mark.parametrize(("log", "lacks"), [(FORMAT_2, "mask_bits"), (FORMAT_3, "camera_from_object")])
+@pytest.mark.parametrize(("log", "lacks"), [(FORMAT_2, "mask_bits"), (FORMAT_3, "camera_from_object"),
+                                            (FORMAT_4, "rotations")])
 def test_what_a_format_did_not_have_is_no_difference(tmp_path, log, lacks):
-    """Format 2 had neither masks nor candidates, and format 3 no poses; all else is compared."""
+    """Format 2 had neither masks nor candidates, format 3 no poses, format 4 no more than one; all else is compared."""
     assert {getattr(m, lacks) is None for t, _, m in RunReader(log) if t == PERCEPT} == {True}
     done = saccade(log, "--into", "perception,belief,planner", "--check", "--bus", "local", "--out",
                    tmp_path / "replay")

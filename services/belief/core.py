@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from saccade.services.belief.free_energy import crop_term, identity_term, likelihood_term, pose_term, position_term
-from saccade.services.belief.pose import GoalView
+from saccade.services.belief.pose import GoalView, LatentLikeness, Likeness, TurnLikeness
 from saccade.services.belief.position import PositionFilter, evidence_of
 from saccade.shared.bus.messages import Belief, Percept
 from saccade.shared.bus.topics import BELIEF, GOAL_PERCEPT, PERCEPT, Output
@@ -70,12 +70,18 @@ class BeliefFilter:
         if not self.goal_known:
             self.goal_known = True
             self.goal_views = {
-                name: GoalView(self.config.belief, self.transitions[name], goal)
-                for name, goal in inputs["goal_percept"].items()
-                if len(goal.latent_mean) and goal.presence > WORTH_COMPARING}
+                name: GoalView(self.config.belief, likeness, goal)
+                for name, goal in inputs["goal_percept"].items() if goal.presence > WORTH_COMPARING
+                for likeness in self._likeness(goal)}
         present = {name for name in self.names if percepts[name].presence > self.config.belief.present_above}
         for name in self.names:
             yield Output(BELIEF, self._update(name, percepts, present), name)
+
+    def _likeness(self, goal: Percept) -> list[Likeness]:
+        """How views of an object are compared with its percept in the goal image. Empty if they cannot be."""
+        if goal.rotations is not None:
+            return [TurnLikeness(goal)]
+        return [LatentLikeness(self.transitions[goal.object], goal)] if len(goal.latent_mean) else []
 
     def _update(self, name: str, percepts: dict[str, Percept], present: set[str]) -> Belief:
         percept, position = percepts[name], self.positions[name]

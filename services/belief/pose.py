@@ -3,16 +3,19 @@
 The directions are the cells of a grid on the hemisphere above the object. For each view, the CCN's transition moves the
 latent pose of the view to every cell. A cell is as likely as the goal's latent pose is under the moved one (paper,
 equations 2 and 5). The likelihoods of views from different places are multiplied. For a nearly symmetric object the
-posterior may have several modes; new views decide between them.
+posterior may have several modes; new views decide between them. Percepts that tell rotations in place of a latent pose
+are fused over the turn of the object (`services/belief/turn.py`).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from saccade.services.belief.turn import GoalDirections, turn_probability
 from saccade.shared.bus.messages import Percept
 from saccade.shared.config import BeliefConfig
 from saccade.shared.model.latent import LatentTransition, log_density
@@ -41,15 +44,70 @@ SAME_SCALE = 0.3  # chosen: weight of the prior that the goal's range is as meas
 MOVED_M = 0.01  # chosen: if the object's position changes by more than this, all displacements are computed again
 
 
+class Likeness(Protocol):
+    """What one view says of the goal's direction: log probabilities over something that is the same in all views."""
+
+    def of(self, percept: Percept, center: Array) -> Array:
+        """Log probabilities by one view alone of an object that is believed to be at `center` [3]."""
+
+    def grid(self, log_probability: Array) -> Array:
+        """Log probabilities of the directions of the viewing grid [E, A], from fused ones of that something."""
+
+
+class LatentLikeness:
+    """The likeness by latent poses, directly over the directions of the grid. `goal` is the object's percept in the
+    goal image."""
+
+    def __init__(self, transition: LatentTransition, goal: Percept):
+        self.transition = transition
+        self.goal_mean, self.goal_std = np.array(goal.latent_mean), np.array(goal.latent_std)
+        elevation, azimuth = viewing_grid()
+        self.elevation, self.azimuth = (x.ravel() for x in np.meshgrid(elevation, azimuth, indexing="ij"))
+
+    def of(self, percept: Percept, center: Array) -> Array:
+        """Log probability of each direction of the grid [E, A]. It has a lower limit (OUTLIER), because a view may be
+        wrong."""
+        azimuth, elevation, _ = spherical(percept.world_from_camera[:3, 3], center)
+        displacement = np.stack([wrap(self.azimuth - azimuth), self.elevation - elevation], axis=-1)
+        moved_mean, moved_std = self.transition(percept.latent_mean, displacement)
+        score = log_density(self.goal_mean, moved_mean, np.sqrt(moved_std ** 2 + self.goal_std ** 2)).astype(np.float64)
+        share = np.exp(score - score.max())
+        share = (1 - OUTLIER) * share / share.sum() + OUTLIER / len(share)
+        return np.log(share).reshape(GRID_ELEVATIONS, GRID_AZIMUTHS)
+
+    def grid(self, log_probability: Array) -> Array:
+        """The same, because it is over the grid already."""
+        return log_probability
+
+
+class TurnLikeness:
+    """The likeness by rotations, over the turn of the object about the vertical."""
+
+    def __init__(self, goal: Percept):
+        self.directions = GoalDirections(goal)
+
+    def of(self, percept: Percept, center: Array) -> Array:
+        """Log probability of each turn [T]. It does not depend on where the object is."""
+        return np.log(turn_probability(percept))
+
+    def grid(self, log_probability: Array) -> Array:
+        """Log probabilities of the directions of the grid [E, A]."""
+        return np.log(self.directions.of(np.exp(log_probability)))
+
+
 @dataclass(eq=False)
 class Keyframe:
-    """A view of the object that is kept, with its log likelihood over the grid of directions [E, A]."""
+    """A view of the object that is kept, with what it says of the goal's direction (see `Likeness`)."""
 
-    eye: Array  # position of the camera [3], m, world
-    mean: NDArray[np.float32]  # of the latent pose [L]
+    percept: Percept
     quality: float  # see CERTAIN
     range_m: float  # from the percept's scale
     log_likelihood: Array
+
+    @property
+    def eye(self) -> Array:
+        """The position of the camera [3] (m, world)."""
+        return self.percept.world_from_camera[:3, 3]
 
 
 class GoalView:
@@ -58,15 +116,11 @@ class GoalView:
     `goal` is the percept of this object in the goal image.
     """
 
-    def __init__(self, config: BeliefConfig, transition: LatentTransition, goal: Percept):
-        self.config, self.transition = config, transition
-        self.goal_mean = np.array(goal.latent_mean)
-        self.goal_std = np.array(goal.latent_std)
+    def __init__(self, config: BeliefConfig, likeness: Likeness, goal: Percept):
+        self.config, self.likeness = config, likeness
         self.measured_range_m = REFERENCE_RANGE_M / goal.scale
         elevation, azimuth = viewing_grid()
         self.elevation, self.azimuth = (x.ravel() for x in np.meshgrid(elevation, azimuth, indexing="ij"))
-        # Uniform in azimuth and elevation, because goals are drawn like this (paper, section 4.1).
-        self.prior = np.zeros((GRID_ELEVATIONS, GRID_AZIMUTHS))
         self.keyframes: list[Keyframe] = []
         self.center = np.full(3, np.inf)  # last believed position of the object; none yet
 
@@ -78,7 +132,7 @@ class GoalView:
         if np.linalg.norm(center - self.center) > MOVED_M:
             self.center = np.array(center)
             for keyframe in self.keyframes:
-                keyframe.log_likelihood = self._likelihood(keyframe.eye, keyframe.mean)
+                keyframe.log_likelihood = self.likeness.of(keyframe.percept, self.center)
         if self.config.pose == "last":
             self.keyframes = []
         eye = percept.world_from_camera[:3, 3]
@@ -89,36 +143,21 @@ class GoalView:
         self.keyframes = [k for k in self.keyframes if all(k is not other for other in near)]
         if len(self.keyframes) >= self.config.keyframes:
             self.keyframes.remove(min(self.keyframes, key=lambda k: k.quality))
-        mean = np.array(percept.latent_mean)
-        self.keyframes.append(Keyframe(np.array(eye), mean, quality, REFERENCE_RANGE_M / percept.scale,
-                                       self._likelihood(eye, mean)))
+        self.keyframes.append(Keyframe(percept, quality, REFERENCE_RANGE_M / percept.scale,
+                                       self.likeness.of(percept, self.center)))
 
     def here(self, percept: Percept) -> float:
         """Probability, by the present view alone, that the goal image was taken from about this direction."""
         eye = percept.world_from_camera[:3, 3]
-        mean = percept.latent_mean
         last = self.keyframes[-1]
-        kept = np.array_equal(last.eye, eye) and np.array_equal(last.mean, mean)
-        share = np.exp(last.log_likelihood if kept else self._likelihood(eye, mean)).ravel()
+        alone = last.log_likelihood if last.percept is percept else self.likeness.of(percept, self.center)
+        share = np.exp(self.likeness.grid(alone)).ravel()
         near = direction(self.azimuth, self.elevation) @ unit(eye - self.center) > np.cos(HERE_RAD)
         # Near the pole a change of azimuth rotates the image. Only directions with about the present rotation count.
         azimuth, elevation, _ = spherical(eye, self.center)
         turned = np.abs(wrap(self.azimuth - azimuth)) < HERE_RAD / max(float(np.cos(elevation)), HERE_RAD)
         upright = (elevation < np.pi / 2 - 3 * HERE_RAD) | (np.abs(wrap(self.azimuth - azimuth)) < TURNED_RAD)
         return float(share[near & turned & upright].sum())
-
-    def _likelihood(self, eye: Array, mean: NDArray[np.float32]) -> Array:
-        """Log probability of each direction of the grid by one view alone [E, A].
-
-        The probabilities have a lower limit (OUTLIER), because a view may be wrong.
-        """
-        azimuth, elevation, _ = spherical(eye, self.center)
-        displacement = np.stack([wrap(self.azimuth - azimuth), self.elevation - elevation], axis=-1)
-        moved_mean, moved_std = self.transition(mean, displacement)
-        score = log_density(self.goal_mean, moved_mean, np.sqrt(moved_std ** 2 + self.goal_std ** 2)).astype(np.float64)
-        share = np.exp(score - score.max())
-        share = (1 - OUTLIER) * share / share.sum() + OUTLIER / len(share)
-        return np.log(share).reshape(GRID_ELEVATIONS, GRID_AZIMUTHS)
 
     def log_posterior(self) -> Array | None:
         """Log probabilities of the directions of the grid, normalised [E, A]. None before the first view.
@@ -133,9 +172,10 @@ class GoalView:
     def _fuse(self, weights: Array) -> Array:
         # Views are not independent, and they share the error of the goal's percept: together they count as a few views.
         worth = min(self.config.view_worth, self.config.views_worth / weights.sum())
-        total = self.prior + worth * sum(w * k.log_likelihood for w, k in zip(weights, self.keyframes, strict=True))
+        # The prior is uniform in azimuth and elevation, because goals are drawn like this (paper, section 4.1).
+        total = np.asarray(worth * sum(w * k.log_likelihood for w, k in zip(weights, self.keyframes, strict=True)))
         total -= total.max()
-        return total - np.log(np.exp(total).sum())
+        return self.likeness.grid(total - np.log(np.exp(total).sum()))
 
     def _nearness(self, log_posterior: Array) -> Array:
         """How near each kept view is to the likeliest direction, from 0 to 1 for the same direction [views]."""

@@ -184,7 +184,8 @@ def percept(source: Frame | Goal, name: str, seen: Seen, k: int, world_from_came
         log_scale_std=float(seen.log_scale_std[k]), latent_mean=seen.latent_mean[k], latent_std=seen.latent_std[k],
         intrinsics_px=np.asarray(source.intrinsics_px), world_from_camera=np.asarray(world_from_camera),
         reconstruction_error=float(seen.reconstruction_error[k]), mask_bits=seen.mask_bits[k],
-        camera_from_object=None if seen.camera_from_object is None else seen.camera_from_object[k])
+        camera_from_object=None if seen.camera_from_object is None else seen.camera_from_object[k],
+        **({} if not seen.modes else seen.modes[k].fields))
 
 
 def build(config: Config) -> Perception:

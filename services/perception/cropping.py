@@ -22,7 +22,7 @@ class Cropper:
     """
 
     def __init__(self, image: Tensor, masks: Tensor, intrinsics_px: ArrayLike, up: ArrayLike):
-        self.size = image.shape[-1]
+        self.size = np.array([image.shape[-1], image.shape[-2]])  # width and height
         self.pyramid = [image[None]]
         for _ in range(_LEVELS - 1):
             self.pyramid.append(F.avg_pool2d(self.pyramid[-1], 2))

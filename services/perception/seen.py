@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,22 @@ from numpy.typing import NDArray
 def bits(masks: NDArray[np.bool_]) -> NDArray[np.uint8]:
     """Packs masks [K, M, M] row by row into bytes [K, M, B]."""
     return np.packbits(masks, axis=-1)
+
+
+@dataclass(frozen=True)
+class Modes:
+    """How an object may be turned: rotations camera_from_object [M, 3, 3], the likeliest first, their log probabilities
+    [M], and the standard deviation of each (rad) [M]."""
+
+    rotations: NDArray[np.float64]
+    log_probability: NDArray[np.float64]
+    deviation_rad: NDArray[np.float64]
+
+    @property
+    def fields(self) -> dict[str, NDArray[np.float64]]:
+        """The fields of a percept that tell it."""
+        return {"rotations": self.rotations, "log_probability": self.log_probability,
+                "deviation_rad": self.deviation_rad}
 
 
 @dataclass(frozen=True)
@@ -27,3 +43,4 @@ class Seen:
     reconstruction_error: NDArray[np.float64]  # [K]
     mask_bits: NDArray[np.uint8]  # [K, M, B], see `bits`
     camera_from_object: NDArray[np.float64] | None = None  # [K, 4, 4], of networks that estimate poses
+    modes: list[Modes] = field(default_factory=list)  # K, of networks that infer more than one pose

@@ -74,7 +74,7 @@ class Percept(Message):
     """What the networks of one object made of one image (paper, section 3.2), on `percept` and `goal_percept`. On
     `goal_percept` the camera's pose is unknown: the identity stands for it."""
 
-    VERSION: ClassVar[int] = 3
+    VERSION: ClassVar[int] = 4
 
     object: str
     """Name of the object."""
@@ -103,6 +103,12 @@ class Percept(Message):
     camera_from_object: Annotated[np.ndarray, array("f8", 4, 4)] | None = None
     """Its pose in the camera's frame (metres; the object's frame has its origin at the centre of its box), from
     networks that estimate it in place of a latent pose."""
+    rotations: Annotated[np.ndarray, array("f8", "R", 3, 3)] | None = None
+    """Rotations camera_from_object that it may have, the likeliest first, from networks that tell more than one."""
+    log_probability: Annotated[np.ndarray, array("f8", "R")] | None = None
+    """Their log probabilities."""
+    deviation_rad: Annotated[np.ndarray, array("f8", "R")] | None = None
+    """Their standard deviations, radians."""
 
     def mask(self) -> np.ndarray | None:
         """Where in the image the object is seen: truth values [M, M]. None if the message has no mask."""

@@ -55,7 +55,18 @@ def with_poses() -> Change:
     return change
 
 
-CHANGES: tuple[Callable[[], Change], ...] = (count_in_episodes, with_masks_and_candidates, with_poses)
+def with_several_rotations() -> Change:
+    """Format 4 to 5: percepts may have several rotations."""
+    def change(topic: Topic, part: str | None, fields: Fields) -> Fields:
+        if topic.type is not m.Percept:
+            return fields
+        return fields | {"version": 4} | dict.fromkeys(("rotations", "log_probability", "deviation_rad"))
+
+    return change
+
+
+CHANGES: tuple[Callable[[], Change], ...] = (count_in_episodes, with_masks_and_candidates, with_poses,
+                                             with_several_rotations)
 FORMAT = OLDEST + len(CHANGES)
 
 
