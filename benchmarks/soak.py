@@ -27,7 +27,7 @@ from rich.table import Table
 from saccade.app.log.check import missing
 from saccade.app.run.launch import PROCESSES, launch
 from saccade.app.run.registry import local_pairs
-from saccade.shared.bus.topics import ACTION, STATUS
+from saccade.shared.bus.topics import ACTION, STATUS, Topic
 from saccade.shared.bus.wire import encode
 from saccade.shared.config import Config
 from saccade.shared.errors import SaccadeError
@@ -66,13 +66,14 @@ def victims(rng: random.Random) -> Iterator[str]:
 def soak(seed: int, folder: Path, counts: Counter, rng: random.Random, turn: Iterator[str]) -> None:
     """Runs several episodes once, and adds to the counts."""
     config = Config().with_values({"seed": seed, "scene.names": NAMES, "scene.count": EPISODES})
-    due_s, heard = time.monotonic() + rng.uniform(*EVERY_S), {ACTION}
+    due_s = time.monotonic() + rng.uniform(*EVERY_S)
+    heard: tuple[Topic, ...] = (ACTION,)
 
     def kill(topic, part, message) -> None:
         nonlocal due_s, heard
         if topic in heard and time.monotonic() > due_s:
             due_s = time.monotonic() + rng.uniform(*EVERY_S)
-            heard = {ACTION, STATUS} if rng.random() < AGAIN else {ACTION}
+            heard = (ACTION, STATUS) if rng.random() < AGAIN else (ACTION,)
             name = next(turn)
             if (process := child(name)) is not None:
                 os.kill(process, signal.SIGKILL)

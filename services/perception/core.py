@@ -178,6 +178,7 @@ def _same_view(a: Frame, b: Frame) -> bool:
 
 def percept(source: Frame | Goal, name: str, seen: Seen, k: int, world_from_camera: NDArray) -> Percept:
     """The percept message of object `name`, which is number `k` in `seen`."""
+    modes = seen.modes[k] if seen.modes else None
     return Percept(
         run=source.run, episode=source.episode, step=source.step, object=name, presence=float(seen.presence[k]),
         pixel=seen.pixel[k], pixel_std=float(seen.pixel_std[k]), scale=float(seen.scale[k]),
@@ -185,7 +186,9 @@ def percept(source: Frame | Goal, name: str, seen: Seen, k: int, world_from_came
         intrinsics_px=np.asarray(source.intrinsics_px), world_from_camera=np.asarray(world_from_camera),
         reconstruction_error=float(seen.reconstruction_error[k]), mask_bits=seen.mask_bits[k],
         camera_from_object=None if seen.camera_from_object is None else seen.camera_from_object[k],
-        **({} if not seen.modes else seen.modes[k].fields))
+        rotations=None if modes is None else modes.rotations,
+        log_probability=None if modes is None else modes.log_probability,
+        deviation_rad=None if modes is None else modes.deviation_rad)
 
 
 def build(config: Config) -> Perception:

@@ -191,23 +191,24 @@ class Placed:
         rows = [row for _, row in compared]
         near = np.argmax(directions @ directions[[view for view, _ in compared]].T, axis=1)
         share = share * self.compared.same[rows].sigmoid().double().numpy()[near]
-        towards, weights, deviations = [], [], []
+        towards: list[Array] = []
+        weights: list[float] = []
         for view, row in compared:
             cap = directions @ directions[view] > np.cos(CAP_RAD)
             towards.append(turned(directions[view], self.compared.turn[row].double().numpy()))
-            weights.append(share[cap].sum())
-            deviations.append(np.sqrt(2.0) * float(self.compared.log_std[row, 2].exp()))
+            weights.append(float(share[cap].sum()))
             share = np.where(cap, 0.0, share)
         rest = np.argsort(-share)[:MODES - len(compared)]
-        towards, weights = np.concatenate([towards, directions[rest]]), np.concatenate([weights, share[rest]])
-        deviations = np.concatenate([deviations, np.full(len(rest), VIEW_STD_RAD)])
-        order = np.argsort(-weights)
-        weights = np.maximum(weights[order], 1e-12)
+        deviation = np.concatenate([np.sqrt(2.0) * self.compared.log_std[rows, 2].exp().double().numpy(),
+                                    np.full(len(rest), VIEW_STD_RAD)])
+        weight = np.maximum(np.concatenate([weights, share[rest]]), 1e-12)
+        order = np.argsort(-weight)
         camera = upright(self.ray[None], self.up)[0]
         roll = np.eye(3)
         roll[:2, :2] = _rolled(self.roll).T
-        rotations = camera @ roll @ rotation_towards(-towards[order]).transpose(0, 2, 1)
-        return Modes(rotations, np.log(weights / weights.sum()), deviations[order])
+        all_towards = np.concatenate([towards, directions[rest]])[order]
+        rotations = camera @ roll @ rotation_towards(-all_towards).transpose(0, 2, 1)
+        return Modes(rotations, np.log(weight[order] / weight.sum()), deviation[order])
 
 
 def turned(known: Array, turn: Array) -> Array:

@@ -22,12 +22,6 @@ class Modes:
     log_probability: NDArray[np.float64]
     deviation_rad: NDArray[np.float64]
 
-    @property
-    def fields(self) -> dict[str, NDArray[np.float64]]:
-        """The fields of a percept that tell it."""
-        return {"rotations": self.rotations, "log_probability": self.log_probability,
-                "deviation_rad": self.deviation_rad}
-
 
 @dataclass(frozen=True)
 class Seen:

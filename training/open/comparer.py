@@ -11,6 +11,7 @@ from torch import Tensor
 
 from saccade.services.perception.comparer import Compared, Comparison
 from saccade.services.perception.view_encoder import ViewEncoder
+from saccade.shared.world.geometry import rotation_towards
 from saccade.training.open.composer import Crops
 from saccade.training.open.encoder import batch
 from saccade.training.open.material import Material
@@ -96,16 +97,15 @@ def pairs(material: Material, encoder: ViewEncoder, crops: Crops, rng: np.random
     for number, towards in zip(which, direction, strict=True):
         views = material.tiles[number].directions
         angle = np.arccos(np.clip(views @ towards, -1, 1))
-        close = np.flatnonzero(angle < max(MARGIN_RAD, 1.01 * angle.min()))
-        chosen = int(rng.choice(close))
+        chosen = int(rng.choice(np.flatnonzero(angle < max(MARGIN_RAD, 1.01 * angle.min()))))
         near.append(chosen)
         turn.append(turn_between(views[chosen], towards))
     mine = material.composed.known(which, np.array(near))
     # The others: of the batch's known views, that which is most alike by the encoder and shows something else.
     # Flat views of the crops' own directions say whether it can be told apart at all.
     similar = encoder(crops.seen) @ encoder(crops.known).T
-    angle = (crops.direction @ crops.direction.T).clamp(-1, 1).arccos()
-    close = (crops.object[:, None] == crops.object) & (angle < OTHER_RAD)
+    between = (crops.direction @ crops.direction.T).clamp(-1, 1).arccos()
+    close = (crops.object[:, None] == crops.object) & (between < OTHER_RAD)
     flat = F.avg_pool2d(crops.known, 4).flatten(1)
     alike = torch.cdist(flat, flat) ** 2 / flat.shape[1] < ALIKE / 4
     noisy = similar - 9.0 * (close | alike) + 0.15 * torch.randn(similar.shape, generator=torch.Generator().manual_seed(
@@ -123,8 +123,6 @@ def pairs(material: Material, encoder: ViewEncoder, crops: Crops, rng: np.random
 def turn_between(known: np.ndarray, seen: np.ndarray) -> np.ndarray:
     """The direction [3] `seen` from the direction `known`, as an angle to the right and one up as the camera of the
     known view sees its own motion [2] (rad)."""
-    from saccade.shared.world.geometry import rotation_towards
-
     rotation = rotation_towards(-known)
     along = rotation.T @ seen
     flat = along[:2]
