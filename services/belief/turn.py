@@ -36,10 +36,11 @@ def turn_probability(percept: Percept) -> Array:
     turn = np.arctan2(world[:, 1, 0] - world[:, 0, 1], world[:, 0, 0] + world[:, 1, 1])
     tilt = np.arccos(np.clip(world[:, 2, 2], -1.0, 1.0))
     weight = np.exp(percept.log_probability - 0.5 * (tilt / UPRIGHT_RAD) ** 2)
-    density = weight @ _bells(wrap(turns() - turn[:, None]), percept.deviation_rad[:, None])
-    total = density.sum()
-    share = density / total if total > 0 else np.full(TURNS, 1 / TURNS)
-    return (1 - OUTLIER) * share + OUTLIER / TURNS
+    bells = _bells(wrap(turns() - turn[:, None]), percept.deviation_rad[:, None])
+    upright = weight @ (bells / bells.sum(1, keepdims=True))
+    # What the modes of an object that is not upright have says nothing.
+    share = upright + max(1.0 - float(upright.sum()), 0.0) / TURNS
+    return (1 - OUTLIER) * share / share.sum() + OUTLIER / TURNS
 
 
 class GoalDirections:
