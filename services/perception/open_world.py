@@ -104,7 +104,7 @@ class OpenWorld:
 
     def _view(self, k: int, view: int) -> Tensor:
         """A view of a bank [4, 64, 64] from 0 to 1."""
-        return torch.from_numpy(self.banks[k].images[view]).permute(2, 0, 1).float() / 255.0
+        return torch.from_numpy(self.banks[k].image(view).copy()).permute(2, 0, 1).float() / 255.0
 
     def _candidates(self, k: int, similar: Tensor) -> list[tuple[int, int, int]]:
         """Which things [P, V] are compared with object k, and with which of its views: (object, thing, view)."""
