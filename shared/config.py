@@ -128,7 +128,7 @@ class PerceptionConfig(Section):
 
     weights: Path | None = None
     """Folder with trained weights. Without it, those that come with the object set."""
-    architecture: Literal["default", "paper", "posecnn", "lexa"] = "default"
+    architecture: Literal["default", "paper", "posecnn", "lexa", "open"] = "default"
     """Which networks: Saccade's own, those of the paper's tables, PoseCNN, or the policy of LEXA."""
     passes: int = Field(2, ge=1, le=4)
     """How often each crop is corrected and cut again."""

@@ -4,11 +4,15 @@ import numpy as np
 import pytest
 import torch
 
+from saccade.services.perception.open_world import turned
 from saccade.services.perception.view_encoder import ViewEncoder
 from saccade.shared.errors import SaccadeError
 from saccade.shared.render.groceries import grocery
 from saccade.shared.world.geometry import INTRINSICS_PX, fibonacci_sphere, project
+from saccade.training.crops import warp
+from saccade.training.open.comparer import turn_between
 from saccade.training.open.composer import CropMaker
+from saccade.training.open.table_crops import TableCrops, sights_of
 from saccade.training.open.tables import FRAME_PX, render_tables
 from saccade.training.open.tiles import load_tiles, render_tiles
 
@@ -24,7 +28,7 @@ def meshes():
 def tiles(meshes, tmp_path_factory):
     folder = tmp_path_factory.mktemp("tiles")
     render_tiles(folder, meshes, count=12, variants=2, seed=0)
-    return list(load_tiles(folder, meshes))
+    return list(load_tiles(folder, [mesh.name for mesh in meshes]))
 
 
 def test_groceries_are_of_household_size_centred_and_always_the_same():
@@ -61,7 +65,7 @@ def test_tiles_hold_the_whole_object_flat_and_lit_and_are_rendered_once(tiles, m
     assert rendered == [mesh.name for mesh in meshes[:3]]
     (tmp_path / f"{meshes[0].name}.npy").write_bytes(b"no array")
     with pytest.raises(SaccadeError, match=r"grocery0.npy are missing or damaged"):
-        list(load_tiles(tmp_path, meshes[:1]))
+        list(load_tiles(tmp_path, [meshes[0].name]))
 
 
 def test_crops_show_what_their_labels_say(tiles):
@@ -99,6 +103,44 @@ def test_tables_agree_with_their_labels(meshes):
                 assert np.hypot(u - pixel[0], v - pixel[1]) < reach
                 seen += 1
     assert seen >= 3
+
+
+def test_crops_from_tables_lie_as_those_that_are_composed(tiles, meshes):
+    """Cut out with nothing off, an object on a rendered table covers its bank's view from that direction."""
+    tables = render_tables(meshes, 8, np.random.default_rng(0))
+    sights = sights_of(tables, meshes, {mesh.name: n for n, mesh in enumerate(meshes)})
+    crops = TableCrops(tables.rgb, tables.instance, sights, CropMaker(tiles, CPU))
+    drawn = crops.draw(np.arange(len(sights.table)), np.random.default_rng(0))
+    assert drawn.direction.norm(dim=1).numpy() == pytest.approx(1.0, abs=1e-5)
+    here = (drawn.off[:, :2].abs().max(1).values < 0.1) & (drawn.visible > 0.9)
+    shown, known = drawn.seen[here, 3] > 0.5, drawn.known[here, 3] > 0.5
+    share = (shown & known).sum((1, 2)) / (shown | known).sum((1, 2))
+    assert len(share) >= 2
+    assert float(share.median()) > 0.6
+    near = [np.arccos(np.clip((tiles[o].directions @ d).max(), -1, 1)) for o, d in
+            zip(sights.object, sights.direction, strict=True)]
+    assert max(near) < 0.8  # of twelve views one is always about there
+
+
+def test_what_is_off_is_where_the_comparer_is_told_it_is(tiles):
+    """Moved back by what it is off, a crop's mask lies on that of its view."""
+    maker = CropMaker(tiles, CPU)
+    crops = maker.draw(np.arange(12) % 4, np.arange(12) % 12, np.random.default_rng(5))
+    clear = crops.visible > 0.98
+    before = crops.off[:, :3] * 0
+    shares = []
+    for off in (crops.off[:, :3], before):
+        moved = warp(crops.known[:, 3:], off[:, :2], off[:, 2].exp(), crops.off[:, 3])[:, 0] > 0.5
+        seen = crops.seen[:, 3] > 0.5
+        shares.append(((moved & seen).sum((1, 2)) / (moved | seen).sum((1, 2)))[clear].mean())
+    assert float(shares[0]) > float(shares[1]) + 0.05
+    assert float(shares[0]) > 0.75
+
+
+@pytest.mark.parametrize("turn", [(0.2, 0.0), (0.0, -0.3), (0.15, 0.25)])
+def test_a_turn_and_its_measure_belong_together(turn):
+    known = fibonacci_sphere(7)[2]
+    assert turn_between(known, turned(known, np.array(turn))) == pytest.approx(turn, abs=1e-9)
 
 
 def test_the_encoder_gives_unit_vectors():

@@ -88,6 +88,10 @@ def task_of(run_dir: Path, config: TrainingConfig, part: str, device: torch.devi
         from saccade.training.lexa.task import LexaTask
 
         return LexaTask(config, part, device, run_dir / part, step_of(run_dir / part / CHECKPOINT))
+    if config.architecture == "open":
+        from saccade.training.open.tasks import open_task
+
+        return open_task(run_dir, config, part, device)
     views = [load_views(run_dir, name) for name in config.names]
     extraction = config.is_extraction(part)
     if config.architecture == "default":

@@ -17,13 +17,18 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from saccade.services.perception.paper import CROP_SIDE_M
 from saccade.shared.errors import SaccadeError
 from saccade.shared.files import replace_whole, writing
+from saccade.shared.log.provenance import commit
 from saccade.shared.model.weights import ObjectCard, write_weights
 from saccade.shared.render.objects import load_mesh
 from saccade.shared.render.views import crop_side_m
 from saccade.training.checkpoints import ccn_of, finished
 from saccade.training.dataset import render_missing
+from saccade.training.open.material import prepare
+from saccade.training.open.tasks import banks_for
 from saccade.training.part import pick_device
 from saccade.training.settings import EXTRACTION, WHOLE, TrainingConfig, load_settings
+
+NETWORKS = "open"  # folder of the networks that know no object, beside those of the objects' banks
 
 
 def start(run_dir: Path, config: TrainingConfig) -> TrainingConfig:
@@ -64,7 +69,10 @@ def train(run_dir: Path, config: TrainingConfig, *, jobs: int, console: Console)
                 bars[name] = progress.add_task(name, total=total, note="")
             progress.update(bars[name], completed=done, note=note)
 
-        if config.architecture not in WHOLE:  # which render their own images
+        if config.architecture == "open":
+            if config.parts:
+                prepare(run_dir, config, show)
+        elif config.architecture not in WHOLE:  # which render their own images
             render_missing(run_dir, config, lambda name, done, total: show(f"views {name}", done, total))
         _train_parts(run_dir, config, jobs, show)
 
@@ -109,8 +117,14 @@ def _show_part(run_dir: Path, part: str, config: TrainingConfig, show) -> None:
 
 
 def export(run_dir: Path, weights_dir: Path) -> None:
-    """Writes the weights of a finished run and their manifest. Raises SaccadeError if a part is not finished."""
+    """Writes the weights of a finished run and their manifest. Raises SaccadeError if a part is not finished.
+
+    Of the architecture "open", the networks go to a folder of their own beside the objects' banks.
+    """
     config = load_settings(run_dir)
+    if config.architecture == "open":
+        _export_open(run_dir, config, weights_dir)
+        return
     states, losses, commits, seconds = {}, {}, {}, 0.0
     for part in config.parts:
         facts, states[part] = finished(run_dir, config, part)
@@ -137,6 +151,25 @@ def export(run_dir: Path, weights_dir: Path) -> None:
         "data": described[config.architecture],
         "training": config.model_dump(mode="json"), "losses": losses, "commits": commits,
         "where_trained": _where(pick_device(config.device)), "seconds": round(seconds), "torch": torch.__version__})
+
+
+def _export_open(run_dir: Path, config: TrainingConfig, weights_dir: Path) -> None:
+    networks = weights_dir.parent / (config.networks or NETWORKS)
+    if config.parts:
+        trained = {part: finished(run_dir, config, part) for part in config.parts}
+        losses = {part: json.loads((run_dir / part / "losses.jsonl").read_text().splitlines()[-1])
+                  for part in config.parts}
+        write_weights(networks, {part: state for part, (_, state) in trained.items()}, (), {
+            "architecture": config.architecture, "data": "views and rendered tables of scanned objects, and of "
+            f"{config.groceries} groceries made by code", "training": config.model_dump(mode="json"), "losses": losses,
+            "commits": {part: facts.get("commit", "unknown") for part, (facts, _) in trained.items()},
+            "where_trained": _where(pick_device(config.device)),
+            "seconds": round(sum(facts["seconds"] for facts, _ in trained.values())), "torch": torch.__version__})
+    cards = tuple(ObjectCard(name, size, crop_side_m(size)) for name, size in
+                  ((name, load_mesh(config.objects, name).size_m) for name in config.names))
+    write_weights(weights_dir, {}, cards, {
+        "architecture": config.architecture, "networks": networks.name, "commit": commit(),
+        "data": f"views of the objects of {config.objects!r} from all around"}, banks_for(config, networks))
 
 
 def _calibration(config: TrainingConfig, losses: dict[str, dict]) -> dict[str, float]:

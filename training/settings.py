@@ -24,8 +24,13 @@ PAPER = {"steps_ccn": 5_000, "steps_extraction": 6_000, "batch_ccn": 150, "batch
 POSECNN = {"steps_extraction": 8_000, "batch_extraction": 16, "rate_extraction": 1e-3}
 # The defaults of LEXA: a batch is pieces of 25 images; an episode of 50 steps is lived through every 20 steps.
 LEXA = {"steps_extraction": 20_000, "batch_extraction": 16, "rate_extraction": 2e-4}
-DEFAULTS: dict[str, dict[str, Any]] = {"paper": PAPER, "posecnn": POSECNN, "lexa": LEXA}
-OF_OTHERS = ("architecture", "kl_extraction", "guide_extraction", "ccns", "symmetric")
+# The defaults of the networks that know no object by name. The proposer counts as phase 2, the two others as phase 1.
+OPEN = {"views": 400, "steps_ccn": 6_000, "steps_extraction": 4_000, "batch_ccn": 80, "batch_extraction": 16,
+        "rate_ccn": 1.2e-3, "rate_extraction": 1.5e-3}
+OPEN_PARTS = ("proposer", "encoder", "comparer")
+DEFAULTS: dict[str, dict[str, Any]] = {"paper": PAPER, "posecnn": POSECNN, "lexa": LEXA, "open": OPEN}
+OF_OTHERS = ("architecture", "kl_extraction", "guide_extraction", "ccns", "symmetric", "networks", "scans", "held_out",
+             "groceries", "tables")
 
 
 class TrainingConfig(Section):
@@ -41,6 +46,12 @@ class TrainingConfig(Section):
     `ccns` is a folder of weights whose CCNs of these objects are used unchanged, so that only phase 2 is trained.
 
     With "posecnn" there is one network. `symmetric` are the objects whose rotation has the loss for symmetric objects.
+
+    With "open" there are three networks that know no object, and a bank of views for each object of the set. They are
+    trained on the set's objects, on the meshes in the folders `scans` (each in a folder of its own), but for those that
+    are `held_out` to evaluate on, on `groceries` made by code, and on rendered `tables`. With `networks`, a folder of
+    weights beside the new ones, its networks are used unchanged, and only the banks are made.
+
     If the architecture is "default", the settings that only others have are not saved.
     """
 
@@ -62,6 +73,11 @@ class TrainingConfig(Section):
     guide_extraction: float = Field(300.0, ge=0)
     ccns: str | None = None
     symmetric: tuple[str, ...] = ()
+    networks: str | None = None
+    scans: tuple[str, ...] = ()
+    held_out: tuple[str, ...] = ()
+    groceries: int = Field(800, ge=0, le=10_000)
+    tables: int = Field(6_000, ge=1, le=100_000)
 
     @model_validator(mode="before")
     @classmethod
@@ -83,17 +99,21 @@ class TrainingConfig(Section):
             return (*(() if self.ccns else self.names), *(f"{name}.{EXTRACTION}" for name in self.names))
         if self.architecture in WHOLE:
             return (self.architecture,)
+        if self.architecture == "open":
+            return () if self.networks else OPEN_PARTS
         return (EXTRACTION, *self.names)
 
     def is_extraction(self, part: str) -> bool:
         """Whether a part belongs to phase 2."""
-        return part.rpartition(".")[2] in (EXTRACTION, *WHOLE)
+        return part.rpartition(".")[2] in (EXTRACTION, OPEN_PARTS[0], *WHOLE)
 
     def needs(self, part: str) -> str | None:
         """The part that must be finished before this one begins, or None.
 
-        The paper's phase 2 needs the finished CCN of its object.
+        The paper's phase 2 needs the finished CCN of its object, and the comparer needs the encoder.
         """
+        if self.architecture == "open":
+            return "encoder" if part == "comparer" else None
         name = self.object_of(part)
         return name if name != part and not self.ccns else None
 

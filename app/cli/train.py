@@ -28,9 +28,9 @@ def train(*, objects: Objects = None, names: Names = None,
           device: Annotated[Literal["auto", "cpu", "cuda"] | None, typer.Option(
               help="Where to compute: on a GPU if there is one, or always on the named device.",
               show_default="auto")] = None,
-          architecture: Annotated[Literal["default", "paper", "posecnn", "lexa"], typer.Option(
-              help="Saccade's networks, those of the paper's tables, PoseCNN, or LEXA. Others than Saccade's go to "
-                   "folders named <set>-<architecture>.")] = "default",
+          architecture: Annotated[Literal["default", "paper", "posecnn", "lexa", "open"], typer.Option(
+              help="Saccade's networks, those of the paper's tables, PoseCNN, LEXA, or networks that know objects by "
+                   "their views alone. Others than Saccade's go to folders named <set>-<architecture>.")] = "default",
           weights: WeightsFolder = None, values: Annotated[list[str] | None, typer.Option(
               "--set", metavar="KEY=VALUE", help="Set a training setting, such as batch_ccn=64. The guide's page "
                                                  "'Train networks' names the most important ones.")] = None) -> None:

@@ -55,6 +55,7 @@ DEFAULT_AGENT = "sceneccn"
 ALL_THREE = ("perception", "belief", "planner")
 AGENTS = {
     "sceneccn": Agent(ALL_THREE),
+    "open": Agent(ALL_THREE, preset="open"),
     "paper": Agent(ALL_THREE, preset="paper"),
     "posecnn": Agent(("perception", "planner"), preset="posecnn", knows="RGB, depth, camera pose"),
     "posecnn-infogain": Agent(ALL_THREE, preset="posecnn-infogain", knows="RGB, depth, camera pose"),

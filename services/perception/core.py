@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from saccade.services.perception.cropping import Cropper
 from saccade.services.perception.networks import INPUT_PX, Extraction, Identity, tally
+from saccade.services.perception.open_world import open_world_of
 from saccade.services.perception.paper import PaperSceneCCN
 from saccade.services.perception.posecnn import PoseCNN
 from saccade.services.perception.seen import Seen, bits
@@ -112,6 +113,8 @@ def model_of(weights: Weights, names: tuple[str, ...], passes: int) -> Model:
         return PaperSceneCCN(weights, names)
     if weights.architecture == "posecnn":
         return PoseCNN(weights, names)
+    if weights.architecture == "open":
+        return open_world_of(weights, names)
     return SceneCCN(weights, names, passes)
 
 
@@ -191,11 +194,16 @@ def percept(source: Frame | Goal, name: str, seen: Seen, k: int, world_from_came
         deviation_rad=None if modes is None else modes.deviation_rad)
 
 
+def _kind(architecture: str) -> str:
+    """What stands for all architectures that can replace each other in an agent."""
+    return WITH_LATENTS[0] if architecture in WITH_LATENTS else architecture
+
+
 def build(config: Config) -> Perception:
     """Creates the core from a run's configuration. Raises SaccadeError if the weights do not serve its objects, or if
     they infer poses where latent poses are wanted, or the reverse."""
     weights, wanted = Weights(config.weights), config.perception.architecture
-    if (weights.architecture in WITH_LATENTS) != (wanted in WITH_LATENTS):
+    if _kind(weights.architecture) != _kind(wanted):
         raise SaccadeError(f"weights {weights.folder} are of the architecture {weights.architecture!r}, and this agent "
                            f"needs {wanted!r}: name other weights, or choose the agent that works with these")
     return Perception(lambda names: model_of(weights, names, config.perception.passes), config.names)

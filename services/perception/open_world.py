@@ -15,12 +15,14 @@ import torch.nn.functional as F
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from saccade.services.perception.bank import FILLED, Bank
+from saccade.services.perception.bank import FILLED, Bank, bank_of
 from saccade.services.perception.comparer import Compared, Comparison
 from saccade.services.perception.cropping import Cropper
 from saccade.services.perception.proposer import Proposals, Proposer, propose
 from saccade.services.perception.seen import Modes, Seen, bits
 from saccade.services.perception.view_encoder import ViewEncoder
+from saccade.shared.errors import SaccadeError
+from saccade.shared.model.weights import Weights
 from saccade.shared.world.geometry import REFERENCE_RANGE_M, pixel_rays, pose, rotation_towards, unit
 from saccade.shared.world.windows import Window, upright
 
@@ -36,6 +38,25 @@ SHARPNESS = 20.0  # of the similarities, if the manifest gives none
 
 Array = NDArray[np.float64]
 NOT_SEEN = Modes(np.eye(3)[None], np.zeros(1), np.full(1, np.pi))
+
+
+def open_world_of(weights: Weights, names: tuple[str, ...]) -> OpenWorld:
+    """The networks and the banks of these objects. Raises SaccadeError if the weights lack one of them, are damaged, or
+    are of another architecture."""
+    weights.cards_of(names)
+    shared, banks = weights.networks, []
+    for name in names:
+        try:
+            banks.append(bank_of(name, weights.bank(name)))
+        except (ValueError, KeyError) as error:
+            raise SaccadeError(f"bank of {name} in {weights.folder} is damaged ({error}): make it again") from error
+    networks = [shared.fill(module, stem) for module, stem in (
+        (Proposer(), "proposer"), (ViewEncoder(), "encoder"), (Comparison(), "comparer"))]
+    proposer, encoder, comparison = networks
+    assert isinstance(proposer, Proposer)  # they are what was filled
+    assert isinstance(encoder, ViewEncoder)
+    assert isinstance(comparison, Comparison)
+    return OpenWorld(proposer, encoder, comparison, banks)
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,8 @@
 
 `manifest.json` says how the weights were made (data, seed, steps, losses, commit, where they were trained) and which
 architecture they have (the default one if it names none). It also holds the measures of each object and the SHA-256 of
-every file.
+every file. Weights of the architecture "open" hold a bank for each object; the networks, which know no object, are in
+the folder beside them that `networks` names.
 """
 
 from __future__ import annotations
@@ -11,7 +12,8 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
@@ -27,10 +29,11 @@ from saccade.shared.files import MIB, parse_json, read_bytes, read_text, replace
 if TYPE_CHECKING:
     from torch import nn
 
-Architecture = Literal["default", "paper", "posecnn", "lexa"]
+Architecture = Literal["default", "paper", "posecnn", "lexa", "open"]
 WITH_LATENTS = ("default", "paper")  # architectures with a CCN for each object
 
 MANIFEST = "manifest.json"
+BANK = ".bank"  # ending of the names of files with banks, before their type
 MAX_FILE_BYTES, MAX_MANIFEST_BYTES, MAX_HEADER_BYTES = 64 * MIB, 1 * MIB, 1 * MIB
 MAX_SIDE_M, MAX_NAME = 10.0, 256
 _NEED = "get them again or train anew"
@@ -75,6 +78,18 @@ class Weights:
                                "get a newer version of the program, or train anew")
 
     @property
+    def networks(self) -> Weights:
+        """The weights of the networks that all objects share. Raises SaccadeError if they are missing or damaged."""
+        name = self.manifest.get("networks")
+        if not isinstance(name, str):
+            raise SaccadeError(f"weights manifest {self.folder / MANIFEST} names no networks: {_NEED}")
+        shared = Weights(self.folder.parent / _file_name(name))
+        if shared.architecture != self.architecture:
+            raise SaccadeError(f"weights {shared.folder} are of the architecture {shared.architecture!r}, and those in "
+                               f"{self.folder} need {self.architecture!r}: {_NEED}")
+        return shared
+
+    @property
     def names(self) -> tuple[str, ...]:
         """The objects that these weights know."""
         return tuple(card.name for card in self.cards)
@@ -97,6 +112,18 @@ class Weights:
         The hash of the file is checked first. Raises SaccadeError if the file is missing or damaged, or if its hash is
         wrong.
         """
+        with self._file(stem) as data:
+            return {key.removeprefix(prefix): array for key, array in _arrays(data).items() if key.startswith(prefix)}
+
+    def bank(self, name: str) -> dict[str, NDArray[Any]]:
+        """Returns the arrays of an object's bank as they are in its file. Raises SaccadeError like `state`."""
+        with self._file(f"{name}{BANK}") as data:
+            _require_short_header(data)
+            return dict(load(data))
+
+    @contextmanager
+    def _file(self, stem: str) -> Iterator[bytes]:
+        """Reads a file and checks its hash. Whatever is wrong with its arrays within the context is a SaccadeError."""
         path = self.folder / f"{stem}.safetensors"
         if not os.path.isfile(path):
             raise SaccadeError(f"weights {path} are missing: {_NEED}")
@@ -104,7 +131,7 @@ class Weights:
         if hashlib.sha256(data).hexdigest() != self.hashes.get(path.name):
             raise SaccadeError(f"weights {path} do not match the hash in {MANIFEST}: get them again or train anew")
         try:
-            return {key.removeprefix(prefix): array for key, array in _arrays(data).items() if key.startswith(prefix)}
+            yield data
         except (SafetensorError, ValueError, KeyError, TypeError) as error:  # even if the hash is right
             raise SaccadeError(f"weights {path} are damaged ({error}): {_NEED}") from error
 
@@ -123,8 +150,7 @@ class Weights:
 def _arrays(data: bytes) -> dict[str, NDArray[np.float32]]:
     """Returns the arrays of a safetensors file in single precision. Raises ValueError, or what safetensors raises, if
     it is not valid."""
-    if int.from_bytes(data[:8], "little") > MAX_HEADER_BYTES:
-        raise ValueError("its header is longer than any of ours")
+    _require_short_header(data)
     arrays = {}
     for key, array in load(data).items():
         if array.dtype.kind != "f":
@@ -134,6 +160,11 @@ def _arrays(data: bytes) -> dict[str, NDArray[np.float32]]:
         if not np.isfinite(arrays[key]).all():
             raise ValueError(f"array {told(key)} has numbers that are not finite")
     return arrays
+
+
+def _require_short_header(data: bytes) -> None:
+    if int.from_bytes(data[:8], "little") > MAX_HEADER_BYTES:
+        raise ValueError("its header is longer than any of ours")
 
 
 def _card(name: str, card: Any) -> ObjectCard:
@@ -157,11 +188,12 @@ def _file_name(name: str) -> str:
 
 
 def write_weights(folder: Path, states: Mapping[str, Mapping[str, ArrayLike]], cards: tuple[ObjectCard, ...],
-                  facts: dict[str, Any]) -> None:
-    """Writes the states in half precision, and the manifest with their hashes. Raises SaccadeError if this fails;
-    weights that were there before then stay as they were."""
+                  facts: dict[str, Any], banks: Mapping[str, dict[str, NDArray[Any]]] | None = None) -> None:
+    """Writes the states in half precision, the banks as they are, and the manifest with their hashes. Raises
+    SaccadeError if this fails; weights that were there before then stay as they were."""
     files = {f"{stem}.safetensors": save({key: np.asarray(value).astype(np.float16, order="C")
                                           for key, value in state.items()}) for stem, state in states.items()}
+    files |= {f"{name}{BANK}.safetensors": save(arrays) for name, arrays in (banks or {}).items()}
     hashes = {name: hashlib.sha256(data).hexdigest() for name, data in files.items()}
     objects = {card.name: {"size_m": [round(float(x), 6) for x in card.size_m], "crop_side_m": card.crop_side_m}
                for card in cards}

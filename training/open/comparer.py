@@ -49,7 +49,7 @@ class ComparerTask:
 
     def loss(self, step: int) -> tuple[Tensor, dict[str, float]]:
         """The loss at a step, and its parts."""
-        drawn = self.pairs(step, self.config.batch_extraction)
+        drawn = self.pairs(step, self.config.batch_ccn)
         with torch.autocast(self.device.type, dtype=torch.bfloat16):
             compared = Compared(self.comparison(drawn.seen, drawn.known))
         return comparing(compared, drawn)

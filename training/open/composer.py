@@ -6,6 +6,7 @@ object's whole outline fills the share FILLED of the picture, but for what the c
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,11 +51,15 @@ class CropMaker:
 
     def __init__(self, tiles: list[Tiles], device: torch.device, seed: int = 0):
         self.tiles, self.device = tiles, device
-        rng = np.random.default_rng(seed)
-        makers = list(SURFACES.values())
-        surfaces = np.stack([makers[n % len(makers)](rng)[::2, ::2] for n in range(BACKGROUNDS)])
-        self.surfaces = torch.from_numpy(surfaces).permute(0, 3, 1, 2).to(device)
+        self.seed = seed
         self.directions = [torch.tensor(t.directions, dtype=torch.float32) for t in tiles]
+
+    @functools.cached_property
+    def surfaces(self) -> Tensor:
+        """Surfaces for backgrounds [S, 3, s, s], as bytes."""
+        rng, makers = np.random.default_rng(self.seed), list(SURFACES.values())
+        surfaces = np.stack([makers[n % len(makers)](rng)[::2, ::2] for n in range(BACKGROUNDS)])
+        return torch.from_numpy(surfaces).permute(0, 3, 1, 2).to(self.device)
 
     def known(self, which: np.ndarray, index: np.ndarray) -> Tensor:
         """The views [B, 4, 64, 64] that banks have: flat, with the outline's circle in the middle."""

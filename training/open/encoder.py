@@ -42,7 +42,7 @@ class EncoderTask:
     def loss(self, step: int) -> tuple[Tensor, dict[str, float]]:
         """The loss at a step, and its parts."""
         rng = np.random.default_rng([self.config.seed, 1, step])
-        crops = batch(self.material, self.config.batch_extraction, rng)
+        crops = batch(self.material, self.config.batch_ccn, rng)
         with torch.autocast(self.device.type, dtype=torch.bfloat16):
             seen, known = self.encoder(crops.seen), self.encoder(crops.known)
         return contrast(seen, known, crops, self.encoder.log_sharpness.exp())
@@ -66,8 +66,8 @@ class EncoderTask:
             turned.append((directions[mine.argmax(1)] * crops.direction).sum(1).clamp(-1, 1).arccos())
         right, angle = torch.cat(named).float(), torch.cat(turned)
         new = torch.tensor(np.isin(material.held_out.sights.object[chosen], material.held_numbers))
-        return {"named": float(right[~new].mean()), "named_new": float(right[new].mean()),
-                "turn_rad": float(angle.median()), "turn_within_0.2": float((angle < 0.2).float().mean()),
+        fresh = {"named_new": float(right[new].mean())} if new.any() else {}
+        return {"named": float(right[~new].mean()), **fresh, "turn_rad": float(angle.median()), "turn_within_0.2": float((angle < 0.2).float().mean()),
                 "turn_within_0.5": float((angle < 0.5).float().mean())}
 
     def draw(self, path: Path) -> None:

@@ -55,7 +55,7 @@ class ProposerTask:
     def loss(self, step: int) -> tuple[Tensor, dict[str, float]]:
         """The loss at a step, and its parts."""
         rng = np.random.default_rng([self.config.seed, 3, step])
-        chosen = rng.integers(len(self.tables.tables.rgb), size=self.config.batch_extraction)
+        chosen = rng.integers(len(self.tables.rgb), size=self.config.batch_extraction)
         image, targets = images(self.tables, self.circles, chosen, rng, self.device)
         with torch.autocast(self.device.type, dtype=torch.bfloat16):
             foreground, votes = self.proposer(image.contiguous(memory_format=torch.channels_last))
@@ -76,8 +76,9 @@ class ProposerTask:
         """How many of the things on held-out tables are found, and how many proposals are of no thing, per image."""
         found, things, false = 0, 0, 0
         shift, ratio = [], []
-        for n in range(EVALUATED):
-            image = torch.from_numpy(self.held_out.tables.rgb[n]).permute(2, 0, 1)[None].float() / 255.0
+        count = min(EVALUATED, len(self.held_out.rgb))
+        for n in range(count):
+            image = torch.from_numpy(self.held_out.rgb[n]).permute(2, 0, 1)[None].float() / 255.0
             foreground, votes = self.proposer(image)
             proposals = propose(foreground[0], votes[0])
             here = self.held_out.sights.table == n
@@ -96,14 +97,15 @@ class ProposerTask:
                         shift.append(float(off[good].min()))
                         ratio.append(float(larger[good].min()))
             false += int((~taken).sum())
-        return {"found": found / max(things, 1), "false": false / EVALUATED,
+        return {"found": found / max(things, 1), "false": false / count,
                 "shift": float(np.median(shift or [9.0])), "log_ratio": float(np.median(ratio or [9.0]))}
 
     @torch.inference_mode()
     def draw(self, path: Path) -> None:
         """Saves sample pictures: images over what is taken for a thing."""
         rng = np.random.default_rng([self.config.seed, 2 ** 31])
-        image, _ = images(self.tables, self.circles, np.arange(8), rng, self.device)
+        image, _ = images(self.tables, self.circles, np.arange(min(8, len(self.tables.rgb))), rng,
+                          self.device)
         foreground, _ = self.proposer(image)
         shown = F.interpolate(foreground.sigmoid()[:, None], scale_factor=STRIDE).expand(-1, 3, -1, -1)
         both = torch.cat([torch.cat(list(image), 2), torch.cat(list(shown), 2)], 1)
@@ -128,8 +130,8 @@ def images(crops: TableCrops, circles: NDArray[np.float64], chosen: NDArray[np.i
     def uniform(*shape: int) -> Tensor:
         return torch.rand(*shape, generator=generator, device=device)
 
-    rgb = torch.from_numpy(crops.tables.rgb[chosen]).to(device).permute(0, 3, 1, 2).float() / 255.0
-    instance = torch.from_numpy(crops.tables.instance[chosen]).to(device)[:, None].float()
+    rgb = torch.from_numpy(crops.rgb[chosen]).to(device).permute(0, 3, 1, 2).float() / 255.0
+    instance = torch.from_numpy(crops.instance[chosen]).to(device)[:, None].float()
     # The frame's place of each pixel: turned, mirrored, enlarged and shifted.
     zoom = ZOOM[0] * (ZOOM[1] / ZOOM[0]) ** uniform(count)
     angle = (uniform(count) * 2 - 1) * torch.where(uniform(count) < 0.3, torch.pi, 0.3)

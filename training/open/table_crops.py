@@ -83,10 +83,11 @@ def _points(mesh: Mesh) -> Array:
 
 
 class TableCrops:
-    """Cuts crops out of tables. `maker` has the views that banks have."""
+    """Cuts crops out of tables: images [F, 256, 256, 3], and which of a table's things each pixel shows
+    [F, 256, 256], see `Tables`. `maker` has the views that banks have."""
 
-    def __init__(self, tables: Tables, sights: Sights, maker: CropMaker):
-        self.tables, self.sights, self.maker = tables, sights, maker
+    def __init__(self, rgb: NDArray[np.uint8], instance: NDArray[np.uint8], sights: Sights, maker: CropMaker):
+        self.rgb, self.instance, self.sights, self.maker = rgb, instance, sights, maker
         axis = (np.arange(FINE_PX) + 0.5) / FINE_PX * 2 - 1
         x, y = np.meshgrid(axis, axis)
         self.plane = torch.tensor(np.stack([x, -y], -1), dtype=torch.float32, device=maker.device)
@@ -105,9 +106,9 @@ class TableCrops:
         shift, roll = (uniform(count, 2) * 2 - 1) * 2 * SHIFT, (uniform(count) * 2 - 1) * ROLL_RAD
         pixels = self._pixels(chosen, shift, scale, roll)
         grid = pixels / FRAME_PX * 2 - 1
-        rgb = torch.from_numpy(self.tables.rgb[sights.table[chosen]]).to(device).permute(0, 3, 1, 2).float() / 255.0
-        mine = self.tables.instance[sights.table[chosen]] == (sights.slot[chosen] + 1)[:, None, None]
-        others = (self.tables.instance[sights.table[chosen]] > 0) & ~mine
+        rgb = torch.from_numpy(self.rgb[sights.table[chosen]]).to(device).permute(0, 3, 1, 2).float() / 255.0
+        mine = self.instance[sights.table[chosen]] == (sights.slot[chosen] + 1)[:, None, None]
+        others = (self.instance[sights.table[chosen]] > 0) & ~mine
         layers = torch.from_numpy(np.stack([mine, others], 1).astype(np.float32)).to(device)
         cut = F.grid_sample(torch.cat([rgb, layers], 1), grid, align_corners=False)
         cut = F.avg_pool2d(cut, 2)

@@ -28,14 +28,13 @@ class Tiles:
     """Views of one object: images [N, V, 80, 80, 4] uint8 (RGB, premultiplied by the coverage, and the coverage).
 
     The first of the V variants is flat, the others are lit. directions [N, 3] point from the object to the camera, in
-    the object's frame. A tile covers `side_m` metres at the object's centre. `circles` [N, 3] are the smallest circles
-    around the object's outline: centre (right, down) and radius, in half sides of the tile.
+    the object's frame. A tile covers the side of the object's crop (`crop_side_m`) at its centre. `circles` [N, 3] are
+    the smallest circles around the object's outline: centre (right, down) and radius, in half sides of the tile.
     """
 
     name: str
     images: NDArray[np.uint8]
     directions: NDArray[np.float64]
-    side_m: float
     circles: NDArray[np.float64]
 
 
@@ -74,6 +73,15 @@ def render_tiles(folder: Path, meshes: Sequence[Mesh], *, count: int, variants: 
                 os.replace(temporary, path)
             progress(mesh.name)
         world.close()
+
+
+def tiles_of(mesh: Mesh, count: int) -> Tiles:
+    """Flat views of one object from `count` directions. Raises SaccadeError if OpenGL does not work."""
+    world = World((mesh,), size_px=TILE_PX * FINER)
+    world.show_table(False)
+    images = _render(world, mesh, count, 1, np.random.default_rng(0))
+    world.close()
+    return Tiles(mesh.name, images, fibonacci_sphere(count), circles_of(images[:, 0, ..., 3]))
 
 
 def _render(world: World, mesh: Mesh, count: int, variants: int, rng: np.random.Generator) -> NDArray[np.uint8]:
@@ -115,11 +123,11 @@ def circles_of(coverage: NDArray[np.uint8]) -> NDArray[np.float64]:
     return np.array(circles)
 
 
-def load_tiles(folder: Path, meshes: Sequence[Mesh]) -> Iterator[Tiles]:
+def load_tiles(folder: Path, names: Sequence[str]) -> Iterator[Tiles]:
     """Opens the tiles of these objects; they are read where they are used. Raises SaccadeError if one is missing or
     damaged."""
-    for mesh in meshes:
-        path = _path(folder, mesh.name)
+    for name in names:
+        path = _path(folder, name)
         try:
             images = np.load(path, mmap_mode="r", allow_pickle=False)
             if images.ndim != 5 or images.shape[2:] != (TILE_PX, TILE_PX, 4) or images.dtype != np.uint8:
@@ -127,8 +135,7 @@ def load_tiles(folder: Path, meshes: Sequence[Mesh]) -> Iterator[Tiles]:
         except (OSError, ValueError) as error:
             raise SaccadeError(f"views {path} are missing or damaged ({error}): remove the file, they are rendered "
                                "again") from error
-        yield Tiles(mesh.name, images, fibonacci_sphere(len(images)), crop_side_m(mesh.size_m),
-                    circles_of(images[:, 0, ..., 3]))
+        yield Tiles(name, images, fibonacci_sphere(len(images)), circles_of(images[:, 0, ..., 3]))
 
 
 def _path(folder: Path, name: str) -> Path:
