@@ -67,9 +67,11 @@ class EncoderTask:
         right, angle = torch.cat(named).float(), torch.cat(turned)
         new = torch.tensor(np.isin(material.held_out.sights.object[chosen], material.held_numbers))
         fresh = {"named_new": float(right[new].mean())} if new.any() else {}
-        return {"named": float(right[~new].mean()), **fresh, "turn_rad": float(angle.median()), "turn_within_0.2": float((angle < 0.2).float().mean()),
+        return {"named": float(right[~new].mean()), **fresh, "turn_rad": float(angle.median()),
+                "turn_within_0.2": float((angle < 0.2).float().mean()),
                 "turn_within_0.5": float((angle < 0.5).float().mean())}
 
+    @torch.inference_mode()
     def draw(self, path: Path) -> None:
         """Saves sample pictures: crops, and the known views from about there."""
         crops = batch(self.material, 16, np.random.default_rng([self.config.seed, 2 ** 31]))
