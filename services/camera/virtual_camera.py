@@ -1,47 +1,25 @@
 """Turns images of a real camera into images that the camera of the training would have seen.
 
 The networks learned scale = 0.40 m / range at one focal length. Unchanged images of another camera would give wrong
-ranges. Two pinhole cameras with the same centre see the same rays, so their images differ by a homography, K' K^-1,
-for any scene. If both have the same attitude and no skew, this homography is a scale and a shift of each axis.
+ranges.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from saccade.shared.errors import SaccadeError, told
 from saccade.shared.world.geometry import IMAGE_SIZE_PX, INTRINSICS_PX
 from saccade.shared.world.images import Size
-
-Intrinsics = tuple[float, float, float, float]  # fx, fy, cx, cy in pixels
+from saccade.shared.world.photographs import Intrinsics
+from saccade.shared.world.resampling import Resampling
 
 MIN_COVERAGE = 0.2  # smallest share of the networks' field of view that images must cover; the rest is filled with grey
 CENTRAL = (0.3, 0.7)  # limits of the principal point, as shares of the image's side
 FILL = 128  # grey; repeating the image's border instead would enlarge objects there and make others appear
-_ROUNDING_PX = 1e-6
-
-
-@dataclass(frozen=True)
-class _Axis:
-    """One axis of the mapping: output pixels [first, last) show the image from `start` to `end` (image pixels)."""
-
-    first: int
-    last: int
-    start: float
-    end: float
-
-
-def _axis(length_px: int, focal: float, center: float, trained_focal: float, trained_center: float) -> _Axis:
-    step = focal / trained_focal  # image pixels per output pixel
-    origin = center - trained_center * step  # the start of the output, in image pixels
-    first = max(0, int(np.ceil(-origin / step - _ROUNDING_PX)))
-    last = min(IMAGE_SIZE_PX, int(np.floor((length_px - origin) / step + _ROUNDING_PX)))
-    return _Axis(first, last, max(0.0, origin + first * step), min(float(length_px), origin + last * step))
 
 
 def assumed_intrinsics(size_px: Size) -> Intrinsics:
@@ -77,10 +55,8 @@ class VirtualCamera:
         width, height = size_px
         if not all(CENTRAL[0] <= share <= CENTRAL[1] for share in (cx / width, cy / height)):
             raise SaccadeError(f"{name}: the principal point is not near the centre of {width}x{height} pixels: {need}")
-        trained_fx, trained_fy, trained_cx, trained_cy = INTRINSICS_PX
-        self._u = _axis(width, fx, cx, trained_fx, trained_cx)
-        self._v = _axis(height, fy, cy, trained_fy, trained_cy)
-        self.coverage = (self._u.last - self._u.first) * (self._v.last - self._v.first) / IMAGE_SIZE_PX ** 2
+        self._resampling = Resampling(size_px, (fx, fy, cx, cy))
+        self.coverage = self._resampling.coverage
         if self.coverage < MIN_COVERAGE:
             raise SaccadeError(f"{name}: images of {width}x{height} pixels would cover {self.coverage:.0%} of the "
                                f"networks' field of view, less than {MIN_COVERAGE:.0%}: {need}, or use a wider lens")
@@ -90,9 +66,4 @@ class VirtualCamera:
         if rgb.shape != (*self.size_px[::-1], 3):
             raise SaccadeError(f"an image of shape {list(rgb.shape)} among images of {self.size_px[0]}x"
                                f"{self.size_px[1]} pixels: all must come from one camera")
-        u, v = self._u, self._v
-        seen = Image.fromarray(rgb).resize((u.last - u.first, v.last - v.first), Image.Resampling.BILINEAR,
-                                           box=(u.start, v.start, u.end, v.end))
-        result = np.full((IMAGE_SIZE_PX, IMAGE_SIZE_PX, 3), FILL, dtype=np.uint8)
-        result[v.first:v.last, u.first:u.last] = np.asarray(seen)
-        return result
+        return self._resampling.of(rgb, FILL)

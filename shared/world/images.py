@@ -14,7 +14,6 @@ from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
 from saccade.shared.errors import SaccadeError
 from saccade.shared.files import MIB, opened
-from saccade.shared.world.geometry import IMAGE_SIZE_PX
 
 Size = tuple[int, int]  # width and height in pixels
 
@@ -41,16 +40,6 @@ def image_size(path: Path, *, what: str = "image", need: str = _NEED) -> Size:
         if image.format == "JPEG" and image.getexif().get(ExifTags.Base.Orientation, 1) >= _FIRST_TURNED:
             return image.size[::-1]
         return image.size
-
-
-def read_goal_image(path: Path) -> NDArray[np.uint8]:
-    """Returns the user's goal image [480, 480, 3] of uint8. Raises SaccadeError if it is not a whole PNG or JPEG in RGB
-    of that size."""
-    need = f"give a PNG or JPEG of {IMAGE_SIZE_PX}x{IMAGE_SIZE_PX} pixels in RGB"
-    width, height = image_size(path, what="goal image", need=need)
-    if (width, height) != (IMAGE_SIZE_PX, IMAGE_SIZE_PX):
-        raise SaccadeError(f"goal image {path} is {width}x{height} pixels: {need}")
-    return read_image(path, what="goal image", need=need)
 
 
 @contextmanager
