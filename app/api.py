@@ -57,9 +57,10 @@ def run(*, goal: str | Path | ArrayLike | None = None, agent: str = DEFAULT_AGEN
         out: str | Path | None = None, config: str | Path | None = None, show: bool = False, **values: Any) -> Run:
     """Runs an agent like the command `saccade run`, and returns when all its episodes are over.
 
-    `goal` is an image to find: a file, or an array [480, 480, 3] of uint8. Without it the goal comes from the
-    simulator's scene, and with a real camera the agent explores. `config` is a configuration file or the name of a
-    preset; the other keywords override its values. `out` is a new folder for the run, by default `runs/<time>-<seed>`.
+    `goal` is an image to find: a file, or an array [H, W, 3] of uint8; `goal_intrinsics_px` are its (fx, fy, cx, cy).
+    Without it the goal comes from the simulator's scene, and with a real camera the agent explores. `config` is a
+    configuration file or the name of a preset; the other keywords override its values. `out` is a new folder for the
+    run, by default `runs/<time>-<seed>`.
     With `show` the progress is printed. Raises SaccadeError if something is wrong that the user can repair.
     """
     from saccade.app.look.picture import draw_run  # here, so that matplotlib is only loaded when it is needed

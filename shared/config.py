@@ -80,7 +80,9 @@ class SceneConfig(Section):
     yaw: Literal["random", "fixed"] = "random"
     """Whether drawn objects are turned about the vertical axis. In the paper they are not (`fixed`)."""
     goal_image: Path | None = None
-    """Image of the view to find, instead of the scene's own goal."""
+    """Image of the view to find, instead of the scene's own goal: PNG or JPEG, of any size."""
+    goal_intrinsics_px: tuple[Focal, Focal, FiniteFloat, FiniteFloat] | None = None
+    """fx, fy, cx, cy of the goal image, in pixels. Without them, its EXIF data are asked."""
     explore: bool = False
     """No goal: the agent finds out what is on the table."""
 

@@ -15,12 +15,13 @@ from saccade.shared.bus.messages import Action, Frame
 from saccade.shared.bus.wire import decode, encode
 from saccade.shared.config import Config
 from saccade.shared.world.geometry import INTRINSICS_PX, project
+from saccade.shared.world.goal_image import read_goal_image
 from saccade.shared.world.task import start_pose
 from saccade.tests.fakes.camera import HERE, THERE, centroid, complaint, dots, folder_of, line, tum, written
 
 
 def camera_of(source, **values):
-    scene = {key: values.pop(key) for key in ("goal_image", "explore") if key in values}
+    scene = {key: values.pop(key) for key in ("goal_image", "goal_intrinsics_px", "explore") if key in values}
     return build(Config().with_values({f"camera.{key}": value for key, value in {"source": source, **values}.items()} |
                                       {f"scene.{key}": value for key, value in scene.items()}))
 
@@ -146,14 +147,17 @@ def test_a_goal_image_of_the_cameras_own_is_resampled_like_its_images(tmp_path):
     assert camera_of(str(tmp_path / "f"), **known, explore=True).goal_rgb is None
 
 
-def test_a_goal_image_of_480_is_taken_as_it_is_and_other_sizes_are_refused(tmp_path):
+def test_a_goal_image_of_480_is_taken_as_it_is_and_one_of_another_size_by_its_own_intrinsics(tmp_path):
     folder_of(tmp_path / "f", ["a.png"], size=(640, 480))
+    path = tmp_path / "goal.png"
     pixels = np.random.default_rng(0).integers(0, 255, (480, 480, 3), dtype=np.uint8)
-    Image.fromarray(pixels).save(tmp_path / "goal.png")
-    np.testing.assert_array_equal(camera_of(str(tmp_path / "f"), goal_image=tmp_path / "goal.png").goal_rgb, pixels)
-    Image.new("RGB", (600, 480)).save(tmp_path / "goal.png")
-    message = complaint(camera_of, str(tmp_path / "f"), goal_image=tmp_path / "goal.png")
-    assert "is 600x480 pixels: give one of 640x480, as the camera's images, or of 480x480" in message
+    Image.fromarray(pixels).save(path)
+    np.testing.assert_array_equal(camera_of(str(tmp_path / "f"), goal_image=path).goal_rgb, pixels)
+    for size, given in (((600, 480), None), ((640, 480), [700, 700, 320, 240])):
+        Image.new("RGB", size, (9, 99, 200)).save(path)
+        camera = camera_of(str(tmp_path / "f"), goal_image=path, goal_intrinsics_px=given)
+        np.testing.assert_array_equal(camera.goal_rgb, read_goal_image(path, given).rgb)
+        assert camera.notes[-1].startswith("goal image goal.png: the intrinsics are ")
 
 
 @pytest.mark.parametrize(("key", "value"), [

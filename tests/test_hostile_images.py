@@ -20,7 +20,8 @@ from saccade.shared.errors import SaccadeError
 from saccade.shared.render import mesh
 from saccade.shared.render.mesh import read_obj, read_texture
 from saccade.shared.world import images
-from saccade.shared.world.images import image_size, read_goal_image, read_image
+from saccade.shared.world.goal_image import read_goal_image
+from saccade.shared.world.images import image_size, read_image
 from saccade.tests.hostile import MANY, complaint, not_files, sparse
 
 POINTS = "v 0 0 0\nv 0 0 1\nv 0 1 0\nvt 0 0\nvt 0 1\nvt 1 0\n"

@@ -18,7 +18,7 @@ from saccade.shared.errors import SaccadeError
 from saccade.shared.render.objects import load_mesh, names_in_use
 from saccade.shared.render.world import World
 from saccade.shared.world.geometry import look_at
-from saccade.shared.world.images import read_goal_image
+from saccade.shared.world.goal_image import read_goal_image
 from saccade.shared.world.task import start_pose
 
 NAMES = ("soup_can", "rice_box")
@@ -172,20 +172,9 @@ def test_an_absent_target_is_in_the_goal_image_only(world, scenes):
     np.testing.assert_array_equal(outputs["truth"].target_center_m, scene.target_placed.center_m)
 
 
-@pytest.mark.parametrize("suffix", ["png", "jpg"])
-def test_a_good_goal_image_is_read(tmp_path, suffix):
-    path = tmp_path / f"goal.{suffix}"
-    Image.new("RGB", (480, 480), (10, 20, 30)).save(path)
-    image = read_goal_image(path)
-    assert image.shape == (480, 480, 3)
-    assert np.abs(image.astype(int) - (10, 20, 30)).max() <= 2
-
-
 def bad_goals(folder):
-    Image.new("RGB", (640, 480)).save(folder / "large.png")
-    Image.new("L", (480, 480)).save(folder / "grey.png")
-    Image.new("RGBA", (480, 480)).save(folder / "alpha.png")
     Image.new("RGB", (480, 480)).save(folder / "other.bmp")
+    Image.new("RGB", (480, 20)).save(folder / "flat.png")
     (folder / "text.png").write_text("not an image")
     rng = np.random.default_rng(0)
     for name in ("cut.png", "cut.jpg"):
@@ -195,17 +184,33 @@ def bad_goals(folder):
 
 
 @pytest.mark.parametrize(("name", "words"), [
-    ("large.png", "is 640x480 pixels"), ("grey.png", "mode L"), ("alpha.png", "mode RGBA"),
-    ("other.bmp", "neither PNG nor JPEG"), ("text.png", "neither PNG nor JPEG"), ("cut.png", "cannot be read"),
-    ("cut.jpg", "cannot be read"), ("nowhere.png", "cannot be read"), ("", "cannot be read")])
+    ("flat.png", "is 480x20 pixels"), ("other.bmp", "neither PNG nor JPEG"), ("text.png", "neither PNG nor JPEG"),
+    ("cut.png", "cannot be read"), ("cut.jpg", "cannot be read"), ("nowhere.png", "cannot be read"),
+    ("", "cannot be read")])
 def test_a_bad_goal_image_is_refused_in_one_line(tmp_path, name, words):
     bad_goals(tmp_path)
     config = Config().with_values({"scene.goal_image": str(tmp_path / name), "scene.names": ["soup_can"]})
     with pytest.raises(SaccadeError) as caught:
         build(config)
     assert words in str(caught.value)
-    assert "give a PNG or JPEG of 480x480" in str(caught.value)
+    assert str(caught.value).startswith("goal image ")
     assert "\n" not in str(caught.value)
+
+
+def test_a_goal_image_of_any_size_and_its_intrinsics_reach_the_goal(tmp_path):
+    """And what is said about them is a note."""
+    pixels = np.random.default_rng(0).integers(0, 255, (300, 400), dtype=np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "goal.png")
+    keys = {"scene.goal_image": str(tmp_path / "goal.png"), "scene.names": ["soup_can"]}
+    for given, words in ((None, "60 degrees is assumed"), ([500, 500, 200, 150], "those that you gave")):
+        simulator = build(Config().with_values(keys | {"scene.goal_intrinsics_px": given}))
+        try:
+            goal = by_topic(simulator.begin("r", 0))["goal"]
+        finally:
+            simulator.world.close()
+        np.testing.assert_array_equal(goal.rgb, read_goal_image(tmp_path / "goal.png", given).rgb)
+        note, = simulator.notes
+        assert words in note
 
 
 def damaged_scan(folder, fault):

@@ -23,7 +23,10 @@ def run(*, objects: Objects = None, names: Names = None, scenes: ScenesFile = No
         n_objects: Annotated[int | None, typer.Option(
             min=1, help="How many objects stand on the table.")] = None, yaw: Yaw = None,
         goal: Annotated[Path | None, typer.Option(
-            help="Image of the view to find: PNG or JPEG, 480x480 pixels.")] = None,
+            help="Image of the view to find: PNG or JPEG.")] = None,
+        goal_intrinsics: Annotated[str | None, typer.Option(
+            help="Intrinsics of the goal image, in pixels.", metavar="fx,fy,cx,cy",
+            show_default="from its EXIF data")] = None,
         explore: Annotated[bool, typer.Option(
             "--explore", help="Explore without a goal: find out what is on the table.")] = False,
         out: Annotated[Path | None, typer.Option(
@@ -58,7 +61,9 @@ def run(*, objects: Objects = None, names: Names = None, scenes: ScenesFile = No
 
     given = {"scene.objects": objects, "scene.names": split_names(names), "scene.file": scenes, "scene.scene": scene,
              "seed": seed, "scene.count": count, "scene.n_objects": n_objects, "scene.yaw": yaw,
-             "scene.goal_image": goal, "scene.explore": explore or None, "bus.kind": bus,
+             "scene.goal_image": goal,
+             "scene.goal_intrinsics_px": numbers(goal_intrinsics, "--goal-intrinsics"),
+             "scene.explore": explore or None, "bus.kind": bus,
              "perception.weights": weights, "camera.source": source, "camera.poses": poses,
              "camera.intrinsics_px": numbers(intrinsics), "camera.rate_hz": rate, "camera.loop": loop or None}
     console = Console()

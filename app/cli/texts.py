@@ -38,9 +38,9 @@ def split_names(names: str | None) -> list[str] | None:
     return None if names is None else [name.strip() for name in names.split(",") if name.strip()]
 
 
-def numbers(text: str | None) -> list[float] | None:
-    """The numbers in a,b; their count and size are for the configuration to check."""
+def numbers(text: str | None, option: str = "--intrinsics") -> list[float] | None:
+    """The numbers in a,b; their count and size are for the caller to check."""
     try:
         return None if text is None else [float(part) for part in text.split(",")]
     except ValueError as error:
-        raise SaccadeError(f"--intrinsics {text!r}: write fx,fy,cx,cy, such as 615,615,320,240") from error
+        raise SaccadeError(f"{option} {text!r}: write fx,fy,cx,cy, such as 615,615,320,240") from error

@@ -16,7 +16,8 @@ from saccade.shared.config import Config
 from saccade.shared.errors import SaccadeError
 from saccade.shared.loop.service import Inputs, Service
 from saccade.shared.world.geometry import IMAGE_SIZE_PX, INTRINSICS_PX
-from saccade.shared.world.images import image_size, read_goal_image, read_image
+from saccade.shared.world.goal_image import LONGEST_PX, GoalImage, read_goal_image
+from saccade.shared.world.photographs import read_photograph
 from saccade.shared.world.task import start_pose
 
 SERVICE = Service("camera", inputs=(ACTION,), trigger=ACTION, outputs=(FRAME, GOAL))
@@ -93,26 +94,27 @@ def build(config: Config) -> Camera:
     source = open_source(camera.source, rate_hz=camera.rate_hz)
     virtual_camera = VirtualCamera(source.size_px, camera.intrinsics_px)
     poses = Poses.still(start_pose()) if camera.poses is None else read_poses(camera.poses, camera.pose_convention)
-    return Camera(source, poses, virtual_camera, goal_rgb=_goal_rgb(config, virtual_camera), loop=camera.loop,
-                  notes=_notes(config, virtual_camera))
+    goal = _goal_of(config, virtual_camera)
+    notes = (*_notes(config, virtual_camera), *((goal.note,) if goal else ()))
+    return Camera(source, poses, virtual_camera, goal_rgb=goal.rgb if goal else None, loop=camera.loop, notes=notes)
 
 
-def _goal_rgb(config: Config, virtual_camera: VirtualCamera) -> NDArray[np.uint8] | None:
-    """The goal image [480, 480, 3], or None if the agent explores.
+def _goal_of(config: Config, virtual_camera: VirtualCamera) -> GoalImage | None:
+    """The goal image, or None if the agent explores.
 
-    The file has the size of the camera's images, and is then resampled like them, or 480x480 pixels. Raises
-    SaccadeError for another size.
+    A file of the size of the camera's images is taken as one of them if its intrinsics are not given. Raises
+    SaccadeError as `read_goal_image` does.
     """
-    path = config.scene.goal_image
-    if path is None or config.scene.explore:
+    scene = config.scene
+    if scene.goal_image is None or scene.explore:
         return None
-    size, (width, height) = image_size(path, what="goal image"), virtual_camera.size_px
-    if size == (width, height):
-        return virtual_camera.see(read_image(path, what="goal image"))
-    if size != (IMAGE_SIZE_PX, IMAGE_SIZE_PX):
-        raise SaccadeError(f"goal image {path} is {size[0]}x{size[1]} pixels: give one of {width}x{height}, as the "
-                           f"camera's images, or of {IMAGE_SIZE_PX}x{IMAGE_SIZE_PX}")
-    return read_goal_image(path)
+    if scene.goal_intrinsics_px is None:
+        longest_px = max(LONGEST_PX, *virtual_camera.size_px)
+        photo = read_photograph(scene.goal_image, longest_px=longest_px, what="goal image")
+        if photo.size_px == virtual_camera.size_px:
+            return GoalImage(virtual_camera.see(photo.rgb), f"goal image {scene.goal_image.name}: as it has the size "
+                             "of the camera's images, their intrinsics are used")
+    return read_goal_image(scene.goal_image, scene.goal_intrinsics_px)
 
 
 def _notes(config: Config, virtual_camera: VirtualCamera) -> tuple[str, ...]:

@@ -18,7 +18,7 @@ from saccade.shared.loop.service import Inputs, Service
 from saccade.shared.render.look import RANDOM, Look, load_look, random_look
 from saccade.shared.render.objects import load_mesh, names_in_use
 from saccade.shared.render.world import World
-from saccade.shared.world.images import read_goal_image
+from saccade.shared.world.goal_image import GoalImage, read_goal_image
 from saccade.shared.world.task import MAX_STEPS, Episode, spheres_around
 
 SERVICE = Service("simulator", inputs=(ACTION,), trigger=ACTION, outputs=(FRAME, GOAL, TRUTH), closed_by=RESULT)
@@ -57,16 +57,17 @@ class Simulator:
 
     Every step gives a Truth and, until the episode is over, a Frame. With `goal_rgb` [H, W, 3] the user's image
     replaces the goal image of the scene. Its viewpoint is unknown, so no step is a success, and the episode ends when
-    the agent says that it has arrived.
+    the agent says that it has arrived. `notes` tells the user what is assumed, one line for each assumption.
     """
 
     def __init__(self, world: World, scenes: Sequence[Scene], *, max_steps: int = MAX_STEPS,
                  publish_depth: bool = False, goal_rgb: NDArray[np.uint8] | None = None, explore: bool = False,
-                 until: Literal["reached", "declared"] = "reached", looks: Looks | None = None):
+                 until: Literal["reached", "declared"] = "reached", looks: Looks | None = None,
+                 notes: tuple[str, ...] = ()):
         self.world, self.scenes, self.max_steps = world, tuple(scenes), max_steps
         self.publish_depth, self.goal_rgb, self.explore = publish_depth, goal_rgb, explore
         self.until = "declared" if goal_rgb is not None else until
-        self.looks = looks or Looks(Config())
+        self.looks, self.notes = looks or Looks(Config()), notes
         # Camera pose, image and depth of the last frame. Where the camera stands still, nothing is rendered again.
         self._shown: tuple[NDArray[np.float64], NDArray[np.uint8], NDArray[np.float32] | None] | None = None
 
@@ -184,9 +185,11 @@ def build(config: Config) -> Simulator:
     Raises SaccadeError if an object, the scenes or the goal image are missing or damaged, or without OpenGL.
     """
     scene, looks = config.scene, Looks(config)
-    goal_rgb = read_goal_image(scene.goal_image) if scene.goal_image is not None else None
+    goal: GoalImage | None = None
+    if scene.goal_image is not None:
+        goal = read_goal_image(scene.goal_image, scene.goal_intrinsics_px)
     meshes = tuple(load_mesh(scene.objects, name) for name in names_in_use(scene))
     scenes = scenes_of(config, {mesh.name: mesh.size_m for mesh in meshes})
     return Simulator(World(meshes), scenes, max_steps=config.simulator.max_steps, until=config.simulator.until,
-                     publish_depth=config.simulator.publish_depth, goal_rgb=goal_rgb, explore=scene.explore,
-                     looks=looks)
+                     publish_depth=config.simulator.publish_depth, goal_rgb=goal.rgb if goal else None,
+                     explore=scene.explore, looks=looks, notes=(goal.note,) if goal and not scene.explore else ())

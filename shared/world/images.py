@@ -25,19 +25,20 @@ _FIRST_TURNED = 5  # from this EXIF orientation on, width and height are exchang
 
 
 def read_image(path: Path, *, what: str = "image", need: str = _NEED) -> NDArray[np.uint8]:
-    """Returns the image [H, W, 3] of uint8. A JPEG is turned upright as its EXIF orientation says.
+    """Returns the image [H, W, 3] of uint8. A JPEG (or MPO, a JPEG with several pictures) is turned upright
+    as its EXIF orientation says.
 
     Raises SaccadeError, which begins with `what` and ends with `need`, if the file is not a whole PNG or JPEG in RGB.
     """
     with _opened_rgb(path, what, need) as image:
-        return np.array(ImageOps.exif_transpose(image) if image.format == "JPEG" else image)
+        return np.array(ImageOps.exif_transpose(image) if image.format != "PNG" else image)
 
 
 def image_size(path: Path, *, what: str = "image", need: str = _NEED) -> Size:
     """Returns width and height in pixels of the upright image, from its header alone. Raises SaccadeError like
     `read_image`."""
     with _opened_rgb(path, what, need) as image:
-        if image.format == "JPEG" and image.getexif().get(ExifTags.Base.Orientation, 1) >= _FIRST_TURNED:
+        if image.format != "PNG" and image.getexif().get(ExifTags.Base.Orientation, 1) >= _FIRST_TURNED:
             return image.size[::-1]
         return image.size
 
