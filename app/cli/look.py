@@ -1,4 +1,5 @@
-"""`saccade view`, `film` and `picture`: commands that show a run."""
+"""`saccade view`, `film` and `picture`, which show a run, `see`, which looks at photographs, and what listens on the
+bus."""
 
 from __future__ import annotations
 
@@ -8,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from saccade.app.cli.options import wide
+from saccade.app.cli.options import Names, Objects, WeightsFolder, wide
 from saccade.shared.errors import SaccadeError
 from saccade.shared.log.folder import PICTURE_NAME
 
@@ -84,6 +85,33 @@ def film(log: Log, out: Annotated[Path, typer.Argument(help="File of the film: O
 
     make_film(log, out, episode=episode, rate_hz=rate, console=Console(stderr=True))
     print(f"written to {out}")
+
+
+@app.command()
+def see(photos: Annotated[list[Path], typer.Argument(metavar="PHOTO...", help="Photographs: PNG or JPEG.")], *,
+        objects: Objects = None, names: Names = None,
+        agent: Annotated[str, typer.Option(help="Whose networks look: sceneccn, open, paper or posecnn.")] = "sceneccn",
+        weights: WeightsFolder = None,
+        intrinsics: Annotated[str | None, typer.Option(
+            help="Intrinsics of the photographs in their own size, in pixels.", metavar="fx,fy,cx,cy",
+            show_default="from their EXIF data")] = None,
+        json_file: Annotated[Path | None, typer.Option(
+            "--json", help="Write what is seen, with masks, as JSON.", metavar="FILE")] = None,
+        out: Annotated[Path | None, typer.Option(
+            help="Save a picture with outlines and names for each photograph.", metavar="FOLDER")] = None) -> None:
+    """Say which objects are in photographs, where, how far, how sure, and how they are turned."""
+    from rich.console import Console
+
+    from saccade.app.cli.texts import configured, numbers, split_names
+    from saccade.app.look.see import see as look_at
+
+    given = numbers(intrinsics)
+    if given is not None and len(given) != 4:
+        raise SaccadeError(f"--intrinsics {intrinsics!r}: write fx,fy,cx,cy, such as 615,615,320,240")
+    config = configured(None, {"scene.objects": objects, "scene.names": split_names(names),
+                               "perception.weights": weights}, None, agent)
+    if look_at(photos, config, agent=agent, intrinsics_px=given, json_file=json_file, out=out, console=wide(Console())):
+        raise typer.Exit(2)  # each one was said
 
 
 Key = Annotated[str, typer.Argument(
