@@ -239,9 +239,17 @@ def test_a_camera_is_live_on_the_bus_and_explores_without_a_goal(tmp_path):
     assert in_world(Config(), "simulator") == Config()
 
 
+def test_the_notes_of_a_simulator_are_said_too():
+    console = Console(file=io.StringIO(), width=200)
+    display = Display(console, plain=True, source="simulator")
+    for part, note in (("simulator", "the goal is black"), ("simulator", "the goal is black"), ("belief", "is slow")):
+        display.take(STATUS, part, sample(Status, service=part, note=note))
+    assert console.file.getvalue().splitlines() == ["simulator: the goal is black"]
+
+
 def test_the_display_does_without_a_truth_and_says_notes_once():
     console = Console(file=io.StringIO(), width=200)
-    display = Display(console, plain=True, judged=False, camera="camera")
+    display = Display(console, plain=True, judged=False, source="camera", live=True)
     for note in ("waits for belief", "one\ntwo", "one\ntwo", "refused: action: bad"):
         display.take(STATUS, "camera", sample(Status, service="camera", note=note))
     display.take(FRAME, None, sample(Frame, episode=0, step=10))

@@ -153,12 +153,13 @@ def _metres(distance_m: float | None) -> str:
 
 class Display:
     """Shows the messages of a run on a console; it is a context manager. Its output is plain if that is asked for, or
-    if the console is not a terminal. `camera` is the name of the source if it is a real camera. Such a source knows no
-    truth, and has notes for the user."""
+    if the console is not a terminal. `source` is the name of the service that gives the images and may have notes for
+    the user. A source that is `live` is a real camera, which knows no truth."""
 
-    def __init__(self, console: Console, *, plain: bool, judged: bool = True, camera: str | None = None) -> None:
+    def __init__(self, console: Console, *, plain: bool, judged: bool = True, source: str,
+                 live: bool = False) -> None:
         self.progress, self.console = Progress(judged=judged), console
-        self._camera = camera
+        self._source, self._is_live = source, live
         self._told: set[str] = set()
         self.plain = plain or not console.is_terminal
         self._live = Live(get_renderable=lambda: panel(self.progress), console=console, transient=True,
@@ -181,23 +182,23 @@ class Display:
 
     @property
     def _view(self) -> Topic:
-        return FRAME if self._camera else TRUTH
+        return FRAME if self._is_live else TRUTH
 
     def say(self, text: str) -> None:
-        """Prints a line that stays, such as what happened to a service, or what a camera assumes."""
+        """Prints a line that stays, such as what happened to a service, or what the source assumes."""
         say(self.console, text)
 
     def take(self, topic: Topic, part: str | None, message: Message) -> None:
         """Takes a message. It must be called with every message of `topics`."""
         self.progress.take(topic, part, message)
-        if isinstance(message, Status) and part == self._camera:
+        if isinstance(message, Status) and part == self._source:
             self.note(message.note)
         if self.plain and topic == self._view and message.step % LINE_EVERY == 0:
             say(self.console, line(self.progress))
 
     def note(self, text: str) -> None:
-        """Prints those lines of a camera's notes that are new."""
+        """Prints those lines of the source's notes that are new."""
         for line in text.splitlines():
             if line not in self._told and not line.startswith((WAITS, REFUSED)):
                 self._told.add(line)
-                self.say(f"{self._camera}: {line}")
+                self.say(f"{self._source}: {line}")

@@ -69,7 +69,7 @@ def run(config: Config, *, agent: str, out: Path | None, plain: bool, console: C
     ended = None  # stays None if the run is interrupted: then no viewer stays
     with ExitStack() as stack:
         with Display(console, plain=plain, judged=config.scene.goal_view_is_known,
-                     camera=place.source if place.live else None) as display:
+                     source=place.source, live=place.live) as display:
             if view:
                 display.say(f"look at {url_of(config.viewer)}")
             try:
