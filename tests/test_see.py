@@ -137,6 +137,17 @@ def test_networks_get_images_of_bounded_size(red_things, tmp_path, size):
         assert model.intrinsics[0][0] == pytest.approx(max(height, width) / 2 / np.tan(np.pi / 6), rel=1e-3)
 
 
+def test_networks_of_one_focal_length_are_told_ranges_of_the_photographs_own(monkeypatch, tmp_path, red_things):
+    """They take the size in the image for that of the training's lens, which is longer: the object is nearer."""
+    red_things()
+    with_red((600, 400), (0, 0, 300, 200)).save(tmp_path / "a.png")
+    photo = see_module.read_photograph(tmp_path / "a.png", (500, 500, 300, 200), longest_px=1280)
+    looker = Looker(Config(), "sceneccn")
+    assert looker.look(photo).sights[0].range_m == pytest.approx(0.8)
+    monkeypatch.setattr(looker.weights, "architecture", "posecnn")
+    assert looker.look(photo).sights[0].range_m == pytest.approx(0.8 * (500 / 600) / (INTRINSICS_PX[0] / 480))
+
+
 def test_run_lengths_are_cocos():
     """Against a count pixel by pixel, of random grids over photographs of several sizes."""
     rng = np.random.default_rng(0)
