@@ -7,8 +7,9 @@ SACCADE = .venv/bin/saccade
 run: .venv/.installed
 	$(SACCADE) run --view
 
+# Two files at a time: many tests wait for processes.
 test: .venv/.installed-dev lint
-	.venv/bin/python -m pytest -q
+	.venv/bin/python -m pytest -q --numprocesses 2 --dist loadfile
 
 # As the user who calls it; root has the containers run as user 1000.
 up:

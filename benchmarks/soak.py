@@ -2,7 +2,7 @@
 
 The runs follow one another until so many processes were killed (default: 200). Every few seconds it is the turn of one,
 after a step; some are killed while another one is still coming back. The router, the recorder and the services all have
-their turn before one of them has its next. The actions of each run must be those of the same run in one process, to the
+their turn before one of them has its next, and none is killed so often that the run has to give it up. The actions of each run must be those of the same run in one process, to the
 byte. What `out.json` counted already counts on, and a run in which something was lost is kept in a folder beside it.
 The exit code is 1 if anything was lost, said twice or done otherwise.
 """
@@ -17,7 +17,7 @@ import signal
 import sys
 import tempfile
 import time
-from collections import Counter
+from collections import Counter, defaultdict, deque
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -27,6 +27,7 @@ from rich.table import Table
 from saccade.app.log.check import missing
 from saccade.app.run.launch import PROCESSES, launch
 from saccade.app.run.registry import local_pairs
+from saccade.app.run.supervisor import RESTARTS, RESTARTS_S
 from saccade.shared.bus.topics import ACTION, STATUS, Topic
 from saccade.shared.bus.wire import encode
 from saccade.shared.config import Config
@@ -68,15 +69,17 @@ def soak(seed: int, folder: Path, counts: Counter, rng: random.Random, turn: Ite
     config = Config().with_values({"seed": seed, "scene.names": NAMES, "scene.count": EPISODES})
     due_s = time.monotonic() + rng.uniform(*EVERY_S)
     heard: tuple[Topic, ...] = (ACTION,)
+    killed_s: dict[str, deque[float]] = defaultdict(lambda: deque([-RESTARTS_S] * RESTARTS, RESTARTS))
 
     def kill(topic, part, message) -> None:
         nonlocal due_s, heard
         if topic in heard and time.monotonic() > due_s:
             due_s = time.monotonic() + rng.uniform(*EVERY_S)
             heard = (ACTION, STATUS) if rng.random() < AGAIN else (ACTION,)
-            name = next(turn)
+            name = next(name for name in turn if time.monotonic() - killed_s[name][0] > RESTARTS_S)
             if (process := child(name)) is not None:
                 os.kill(process, signal.SIGKILL)
+                killed_s[name].append(time.monotonic())
                 counts[KILLED + name] += 1
 
     try:
