@@ -2,9 +2,10 @@
 
 The runs follow one another until so many processes were killed (default: 200). Every few seconds it is the turn of one,
 after a step; some are killed while another one is still coming back. The router, the recorder and the services all have
-their turn before one of them has its next, and none is killed so often that the run has to give it up. The actions of each run must be those of the same run in one process, to the
-byte. What `out.json` counted already counts on, and a run in which something was lost is kept in a folder beside it.
-The exit code is 1 if anything was lost, said twice or done otherwise.
+their turn before one of them has its next, and none is killed so often that the run has to give it up. The actions of
+each run must be those of the same run in one process, to the byte. What `out.json` counted already counts on, and a run
+in which something was lost is kept in a folder beside it. The exit code is 1 if anything was lost, said twice or done
+otherwise.
 """
 
 from __future__ import annotations
