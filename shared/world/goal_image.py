@@ -16,7 +16,7 @@ from saccade.shared.world.resampling import Resampling
 
 LONGEST_PX = 4096  # a larger picture is made smaller first
 WHOLE = 0.995  # share of the networks' field of view; if the picture covers less, the user is told
-BLACK = 128
+BLACK = 0
 
 
 @dataclass(frozen=True)
