@@ -84,7 +84,7 @@ def soak(seed: int, folder: Path, counts: Counter, rng: random.Random, turn: Ite
                 counts[KILLED + name] += 1
 
     try:
-        results = launch(config, folder / "run", kill, say=lambda text: None)
+        results = launch(config, folder / "run", kill, say=lambda text: None, topics=(ACTION, STATUS))
     except SaccadeError as error:
         print(f"seed {seed}: {error}")
         results = []

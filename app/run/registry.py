@@ -55,8 +55,8 @@ DEFAULT_AGENT = "sceneccn"
 ALL_THREE = ("perception", "belief", "planner")
 AGENTS = {
     "sceneccn": Agent(ALL_THREE),
-    "open": Agent(ALL_THREE, preset="open"),
     "paper": Agent(ALL_THREE, preset="paper"),
+    "open": Agent(ALL_THREE, preset="open"),
     "posecnn": Agent(("perception", "planner"), preset="posecnn", knows="RGB, depth, camera pose"),
     "posecnn-infogain": Agent(ALL_THREE, preset="posecnn-infogain", knows="RGB, depth, camera pose"),
     "render-and-compare": Agent(ALL_THREE, preset="render-and-compare", knows="RGB, camera pose, meshes"),

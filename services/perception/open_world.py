@@ -83,6 +83,8 @@ class Match:
 class OpenWorld:
     """The networks, with the banks of K objects."""
 
+    square = False  # an image may have any sides
+
     def __init__(self, proposer: Proposer, encoder: ViewEncoder, comparison: Comparison, banks: list[Bank]):
         self.proposer, self.encoder, self.comparison = proposer.eval(), encoder.eval(), comparison.eval()
         self.banks = banks
