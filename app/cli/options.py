@@ -10,8 +10,8 @@ from typing import Annotated, Any, Literal
 import typer
 
 # A test holds this to the registry, which loads too much for a help text.
-AGENTS = ("sceneccn (Saccade's own), paper, posecnn, posecnn-infogain, render-and-compare, lexa, random-walk, still, "
-          "or oracle (which knows the goal's pose)")
+AGENTS = ("sceneccn (Saccade's own), paper, open, posecnn, posecnn-infogain, render-and-compare, lexa, random-walk, "
+          "still, or oracle (which knows the goal's pose)")
 Objects = Annotated[Literal["pantry", "ycb"] | None, typer.Option(help="Object set.", show_default="pantry")]
 Names = Annotated[str | None, typer.Option(help="Use only these objects of the set, such as a,b.", metavar="NAMES")]
 ConfigFile = Annotated[Path | None, typer.Option(
