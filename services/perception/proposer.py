@@ -83,11 +83,11 @@ def propose(foreground: Tensor, votes: Tensor) -> Proposals:
     aimed = place + votes[:2]  # [2, N]
     half = votes[2].exp()
     found: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
-    left = weight.clone()
+    left, reach = weight.clone(), (NEAR * half).clamp(min=2.0 * STRIDE)  # a peak is known to about a cell
     while len(voters) and len(found) < MOST and float(left.sum()) >= PIXELS:
         center = _peak(aimed, left, half, height, width)
         for _ in range(2):  # of all voters near it, also of those that count for another peak
-            near = ((aimed - center[:, None]) ** 2).sum(0) < (NEAR * half) ** 2
+            near = ((aimed - center[:, None]) ** 2).sum(0) < reach ** 2
             mine = weight * near
             if float(mine.sum()) < 1.0:
                 break
