@@ -1,13 +1,17 @@
 """Trains the view encoder: views that are near on the sphere around an object come near to each other, however they are
-lit, hidden or cut out; views of different objects come apart."""
+lit, hidden or cut out; views of different objects come apart.
+
+A crop is held against the banks of all objects, as it will be later. The banks are encoded anew from time to time,
+because encoding them at every step would take minutes.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from saccade.services.perception.view_encoder import ViewEncoder
@@ -21,18 +25,21 @@ NEAR_RAD = 0.13  # two views of one object count as the same by exp(-(angle / th
 PER_OBJECT = 4  # crops of one object in a batch: two that are near each other, and others
 COMPOSED = 0.6  # share of the crops that are composed; the others are cut out of rendered tables
 REAL = 0.5  # share of the composed crops that show scanned objects, not groceries made by code
+ANEW = 250  # steps after which the banks are encoded anew
+AT_A_TIME = 200  # views that are encoded together
 SEEN = 0.25  # a crop counts if so much of its object is seen
 EVALUATED = 600  # crops in an evaluation
 
 
 class EncoderTask:
-    """Trains the view encoder with soft targets in both directions, from crops to known views and back."""
+    """Trains the view encoder with soft targets: from crops to the banks, and in a batch to known views and back."""
 
     def __init__(self, config: TrainingConfig, material: Material, device: torch.device):
         torch.manual_seed(config.seed)
         self.config, self.material, self.device = config, material, device
         self.encoder = on_device(ViewEncoder(), device)
         self.lambdas: list[float] = []
+        self.banks: Banks | None = None
 
     @property
     def module(self) -> ViewEncoder:
@@ -41,11 +48,18 @@ class EncoderTask:
 
     def loss(self, step: int) -> tuple[Tensor, dict[str, float]]:
         """The loss at a step, and its parts."""
+        if self.banks is None or step % ANEW == 0:
+            self.encoder.eval()
+            self.banks = Banks(self.encoder, self.material, range(len(self.material.tiles)))
+            self.encoder.train()
         rng = np.random.default_rng([self.config.seed, 1, step])
         crops = batch(self.material, self.config.batch_ccn, rng)
         with torch.autocast(self.device.type, dtype=torch.bfloat16):
             seen, known = self.encoder(crops.seen), self.encoder(crops.known)
-        return contrast(seen, known, crops, self.encoder.log_sharpness.exp())
+        sharpness = self.encoder.log_sharpness.exp()
+        among, parts = contrast(seen, known, crops, sharpness)
+        against, right = self.banks.against(seen, crops, sharpness)
+        return among + against, {**parts, "banks": float(against.detach()), "found": right}
 
     def after(self, step: int, smoothed: dict[str, float]) -> None:
         """Does nothing, because this task has no weights that adapt."""
@@ -55,7 +69,8 @@ class EncoderTask:
         """How often crops of held-out tables are named right among all scanned objects, and how far the direction is
         off (rad)."""
         material, rng = self.material, np.random.default_rng([self.config.seed, 2 ** 31])
-        vectors, owner, directions = banks_of(self.encoder, material)
+        banks = Banks(self.encoder, material, material.real)
+        vectors, owner, directions = banks.vectors, banks.owner, banks.directions
         named, turned = [], []
         chosen = rng.choice(len(material.held_out.sights.table), EVALUATED)
         for part in np.split(chosen, 6):
@@ -109,15 +124,32 @@ def contrast(seen: Tensor, known: Tensor, crops: Crops, sharpness: Tensor) -> tu
     return loss, {"contrast": float(loss.detach()), "named": float(right)}
 
 
-@torch.inference_mode()
-def banks_of(encoder: ViewEncoder, material: Material) -> tuple[Tensor, Tensor, Tensor]:
-    """The encoded views of all scanned objects: vectors [V, D], the objects' numbers [V], directions [V, 3]."""
-    vectors, owner, directions = [], [], []
-    for number in material.real:
-        tiles = material.tiles[number]
-        every: NDArray[np.int64] = np.arange(len(tiles.directions))
-        for part in np.array_split(every, max(1, len(every) // 100)):
-            vectors.append(encoder(material.composed.known(np.full(len(part), number), part)))
-        owner.append(torch.full((len(every),), number))
-        directions.append(torch.tensor(tiles.directions, dtype=torch.float32))
-    return torch.cat(vectors), torch.cat(owner), torch.cat(directions)
+class Banks:
+    """The encoded views of objects: vectors [V, D], the objects' numbers [V] and directions [V, 3]."""
+
+    @torch.no_grad()
+    def __init__(self, encoder: ViewEncoder, material: Material, numbers: Iterable[int]):
+        maker = material.composed
+        pairs = [(number, view) for number in numbers for view in range(len(material.tiles[number].directions))]
+        which, index = (np.array(column) for column in zip(*pairs, strict=True))
+        vectors = []
+        for part in np.array_split(np.arange(len(which)), -(-len(which) // AT_A_TIME)):
+            with torch.autocast(maker.device.type, dtype=torch.bfloat16):
+                vectors.append(encoder(maker.known(which[part], index[part])))
+        self.vectors, self.owner = torch.cat(vectors), torch.as_tensor(which, device=maker.device)
+        directions = np.concatenate([material.tiles[number].directions for number in numbers])
+        self.directions = torch.tensor(directions, dtype=torch.float32, device=maker.device)
+
+    def against(self, seen: Tensor, crops: Crops, sharpness: Tensor) -> tuple[Tensor, float]:
+        """The cross entropy of vectors [B, D] of crops against all views, and how often the likeliest is of the
+        object."""
+        angle = (crops.direction @ self.directions.T).clamp(-1, 1).arccos()
+        same = self.owner == crops.object[:, None]
+        # In units of the nearest view's angle where the views of an object are few.
+        nearest = torch.where(same, angle, torch.inf).min(1, keepdim=True).values.clamp(min=NEAR_RAD)
+        target = torch.where(same, torch.exp(-(angle / nearest) ** 2), 0.0)
+        weight = (crops.visible > SEEN).float()
+        logits = sharpness * (seen @ self.vectors.T)
+        each = -(target / target.sum(1, keepdim=True) * logits.log_softmax(1)).sum(1)
+        right = same.gather(1, logits.argmax(1, keepdim=True))[:, 0].float()
+        return (each * weight).sum() / weight.sum().clamp(min=1.0), float((right * weight).sum() / weight.sum())
