@@ -26,6 +26,7 @@ PER_OBJECT = 4  # crops of one object in a batch: two that are near each other, 
 COMPOSED = 0.6  # share of the crops that are composed; the others are cut out of rendered tables
 REAL = 0.5  # share of the composed crops that show scanned objects, not groceries made by code
 ANEW = 250  # steps after which the banks are encoded anew
+OTHERS = 8  # a crop is held against each eighth view of the objects that are not in the batch
 AT_A_TIME = 200  # views that are encoded together
 SEEN = 0.25  # a crop counts if so much of its object is seen
 EVALUATED = 600  # crops in an evaluation
@@ -141,15 +142,17 @@ class Banks:
         self.directions = torch.tensor(directions, dtype=torch.float32, device=maker.device)
 
     def against(self, seen: Tensor, crops: Crops, sharpness: Tensor) -> tuple[Tensor, float]:
-        """The cross entropy of vectors [B, D] of crops against all views, and how often the likeliest is of the
-        object."""
-        angle = (crops.direction @ self.directions.T).clamp(-1, 1).arccos()
-        same = self.owner == crops.object[:, None]
+        """The cross entropy of vectors [B, D] of crops against the views of their objects and some of all others, and
+        how often the likeliest is of the object."""
+        mine = torch.isin(self.owner, crops.object)
+        mine[int(crops.object[0]) % OTHERS::OTHERS] = True
+        angle = (crops.direction @ self.directions[mine].T).clamp(-1, 1).arccos()
+        same = self.owner[mine] == crops.object[:, None]
         # In units of the nearest view's angle where the views of an object are few.
         nearest = torch.where(same, angle, torch.inf).min(1, keepdim=True).values.clamp(min=NEAR_RAD)
         target = torch.where(same, torch.exp(-(angle / nearest) ** 2), 0.0)
         weight = (crops.visible > SEEN).float()
-        logits = sharpness * (seen @ self.vectors.T)
+        logits = sharpness * (seen @ self.vectors[mine].T)
         each = -(target / target.sum(1, keepdim=True) * logits.log_softmax(1)).sum(1)
         right = same.gather(1, logits.argmax(1, keepdim=True))[:, 0].float()
         return (each * weight).sum() / weight.sum().clamp(min=1.0), float((right * weight).sum() / weight.sum())
