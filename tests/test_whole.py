@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 
+import numpy as np
 import pytest
 
-from saccade.services.recorder.whole import Whole
+from saccade.services.recorder.whole import SILENT_S, Patience, Whole
 from saccade.shared.bus.messages import Status
 from saccade.shared.bus.topics import ACTION, BELIEF, FRAME, GOAL, RESULT, STATUS, TRUTH
 from saccade.shared.loop.episodes import NOT_RECORDING, RECORDER, Episodes
@@ -57,6 +58,39 @@ def test_an_episode_without_its_last_message_is_not_whole(lost):
     assert whole.next() == 1
     play(whole, 1, leave_out={lost})
     assert (whole.is_over, whole.is_whole) == (True, False)
+
+
+def test_a_key_that_was_waited_for_in_vain_is_not_waited_for_again():
+    whole = Whole("r", set())
+    play(whole, 0, leave_out={(BELIEF, STEPS - 1)})
+    assert not whole.is_whole
+    whole.give_up()
+    assert whole.next() == 1
+    play(whole, 1, leave_out={(BELIEF, STEPS - 1)})
+    assert whole.is_whole
+    assert whole.next() == 2
+    play(whole, 2, leave_out={(ACTION, STEPS - 1)})
+    assert not whole.is_whole
+
+
+def test_patience_ends_when_all_have_been_there_for_a_while_and_nothing_came():
+    patience = Patience({"belief", "planner"}, 5.0)
+    assert not patience.is_over(100.0, 0.0)  # nobody was heard yet
+    for now_s in np.arange(101.0, 104.0, 0.5):
+        patience.heard("belief", now_s)
+        patience.heard("planner", now_s)
+        assert not patience.is_over(now_s, 0.0)
+    patience.heard("belief", 106.0)
+    assert not patience.is_over(106.0, 0.0)  # the planner is silent: it is starting again
+    for now_s in np.arange(107.0, 111.0, 0.5):
+        patience.heard("belief", now_s)
+        patience.heard("planner", now_s)
+        assert not patience.is_over(now_s, 0.0)
+    assert SILENT_S < 5.0
+    patience.heard("belief", 111.5)
+    patience.heard("planner", 111.5)
+    assert not patience.is_over(111.5, 108.0)  # something came
+    assert patience.is_over(113.0, 108.0)
 
 
 def test_where_nobody_waits_no_episode_is_over():

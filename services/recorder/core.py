@@ -7,14 +7,13 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import math
 import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
 
-from saccade.services.recorder.whole import Whole
+from saccade.services.recorder.whole import Patience, Whole
 from saccade.shared.bus.messages import Message, Status
 from saccade.shared.bus.outbox import KEPT_BYTES
 from saccade.shared.bus.sequences import Key, Sequences
@@ -34,7 +33,7 @@ NAME = RECORDER
 QUEUE_BYTES = 512 * 1024 * 1024
 ASKED_AGAIN_S = 0.5  # time until missing messages are asked for again; it doubles with every attempt
 MOST_INVALID_BYTES = 64 * 1024 * 1024  # of payloads that are not valid messages and are recorded all the same
-GIVEN_UP_S = 15.0  # time until the next episode may begin although one lacks messages
+PATIENCE_S = 5.0  # time until the next episode may begin although one lacks messages; a run that stands ends after 8
 QUIET_S = 1.5  # after this time without a new message the publishers are asked for their latest ones
 
 
@@ -80,8 +79,9 @@ class Recorder:
         self._follows_source = bool(config.bus.wait_for)  # what a replay plays may begin and go on anywhere
         self._episode = 0  # the episode that the source is in
         self._asked_s, self._ask_again_s, self._news_s = 0.0, ASKED_AGAIN_S, time.monotonic()
-        self._whole = Whole(self._run, {n for n in config.bus.wait_for if n != NAME} if self._awaited(config) else None)
-        self._over_s = math.inf  # since when the episode that is recorded now is over
+        others = {name for name in config.bus.wait_for if name != NAME}
+        self._whole = Whole(self._run, others if self._awaited(config) else None)
+        self._patience, self._came_s = Patience(others, PATIENCE_S), time.monotonic()
         self.log = self._open(folder / LOG_NAME, config)
 
     def record(self, inbox: Inbox) -> Health:
@@ -113,7 +113,7 @@ class Recorder:
             self.log.flush_if_due()
         self._tell_whole()
         if item is not None and item[0].in_step:
-            self._news_s = time.monotonic()
+            self._news_s = self._came_s = time.monotonic()
         elif time.monotonic() - self._news_s >= QUIET_S:
             self._ask_for_news()
             self._ask_for_missing()
@@ -175,11 +175,11 @@ class Recorder:
         waits for this, so that no service forgets an episode that the log lacks a part of."""
         due = None
         while self._whole.is_over:
-            self._over_s = min(self._over_s, time.monotonic())
-            lacks = not self._whole.is_whole or self._sequences.lacks(self._run, self._whole.episode)
-            if lacks and time.monotonic() - self._over_s < GIVEN_UP_S:
-                break
-            due, self._over_s = self._whole.next(), math.inf
+            if not self._whole.is_whole or self._sequences.lacks(self._run, self._whole.episode):
+                if not self._patience.is_over(time.monotonic(), self._came_s):
+                    break
+                self._whole.give_up()
+            due = self._whole.next()
         if due is not None:
             self.log.flush()
             self.health.at = (self._run, due, 0)
@@ -280,6 +280,7 @@ class Recorder:
         """Notes which episode the source is in, and that it has finished. While the recorder was away, several episodes
         may have gone by: the source says which one it is in."""
         if isinstance(message, Status):
+            self._patience.heard(part, time.monotonic())
             if part in self._sources and message.run:
                 self._episode = max(self._episode, message.episode)
                 if message.state == "finished" and message.episode == self._episode:

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
+
 from saccade.shared.bus.messages import Message, Status, Truth
 from saccade.shared.bus.topics import RESULT, TOPICS, Topic
+
+SILENT_S = 2.0  # a service that was not heard for this time hangs or is starting again
 
 
 class Whole:
@@ -21,6 +26,7 @@ class Whole:
         self._heard: dict[str | None, tuple[int, int]] = {}  # of each service
         self._steps: dict[int, int] = {}  # the last step of each episode that is done
         self._results: set[int] = set()
+        self._seldom: set[tuple[str, str | None]] = set()  # keys that were waited for in vain
 
     def take(self, topic: Topic, part: str | None, message: Message) -> None:
         """Takes a message of this run."""
@@ -46,12 +52,21 @@ class Whole:
         """Whether every key came as far as the episode did. Its last image needs no answer."""
         if self.episode not in self._steps:
             return False
-        # A latched message counts as one of step 0.
+        if self._lacking():
+            return False
         last = self._steps[self.episode] - 1
-        far = all(at >= (self.episode, 0 if TOPICS[name].latched else last) for (name, _), at in self._last.items())
-        if self.episode > 0 or self._services is None:
-            return far
-        return far and all(self._heard.get(name, (0, -1)) >= (0, last) for name in self._services)
+        return self.episode > 0 or all(self._heard.get(name, (0, -1)) >= (0, last) for name in self._services or ())
+
+    def _lacking(self) -> set[tuple[str, str | None]]:
+        """The keys that did not come as far as the episode did. A latched message counts as one of step 0."""
+        last = self._steps.get(self.episode, 0) - 1
+        return {key for key, at in self._last.items() if key not in self._seldom
+                and at < (self.episode, 0 if TOPICS[key[0]].latched else last)}
+
+    def give_up(self) -> None:
+        """Does not wait for the keys any more that lack the end of the episode: a service may say something at some of
+        the steps only."""
+        self._seldom |= self._lacking()
 
     def next(self) -> int:
         """Goes on to the next episode, and returns its number."""
@@ -59,3 +74,24 @@ class Whole:
         self._steps.pop(self.episode, None)
         self.episode += 1
         return self.episode
+
+
+class Patience:
+    """How long messages are waited for that do not come: until all services have been heard for a while, and none has
+    published anything. One that is starting again is not heard, and then repeats what it has published."""
+
+    def __init__(self, services: Iterable[str], patience_s: float) -> None:
+        self._heard_s = dict.fromkeys(services, -math.inf)
+        self._patience_s, self._since_s = patience_s, -math.inf
+
+    def heard(self, service: str | None, now_s: float) -> None:
+        """Takes note of a status."""
+        if service in self._heard_s:
+            self._heard_s[service] = now_s
+
+    def is_over(self, now_s: float, news_s: float) -> bool:
+        """Whether there is nothing to be waited for any more. The last message of a step came at `news_s`."""
+        if any(now_s - heard_s > SILENT_S for heard_s in self._heard_s.values()):
+            self._since_s = now_s
+        self._since_s = max(self._since_s, news_s)
+        return now_s - self._since_s >= self._patience_s
