@@ -58,3 +58,12 @@ def test_what_was_counted_before_counts_on(tmp_path, monkeypatch):
     soak.main()
     assert runs == [4, 5]
     assert json.loads(out.read_text())["counts"]["killed: router"] == 7
+
+
+def test_a_short_soak_kills_and_loses_nothing(tmp_path, monkeypatch):
+    monkeypatch.setattr(soak, "EPISODES", 3)
+    counts, rng = Counter(), random.Random(1)
+    soak.soak(1, tmp_path, counts, rng, soak.victims(rng))
+    assert soak.killed(counts) >= 2
+    assert {fault: counts[fault] for fault in soak.FAULTS} == dict.fromkeys(soak.FAULTS, 0)
+    assert counts["messages"] > 100
