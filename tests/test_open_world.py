@@ -113,7 +113,7 @@ def test_every_thing_is_proposed_once_at_its_place_also_half_hidden():
     for u, v, radius in circles:
         off = (found.center - torch.tensor([u, v])).norm(dim=1)
         assert float(off.min()) < STRIDE / 2
-        assert float(found.half[off.argmin()]) == pytest.approx(radius, rel=0.05)
+        assert float(found.radius[off.argmin()]) == pytest.approx(radius, rel=0.05)
     assert ((found.masks > 0.5).sum(0) <= 1).all()
 
 

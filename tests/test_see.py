@@ -12,7 +12,7 @@ from PIL import Image
 
 from saccade.app.look import see as see_module
 from saccade.app.look.fitting import Fitted
-from saccade.app.look.see import Looker, drawing_of, view_of
+from saccade.app.look.see import Looker, decoder_of, drawing_of, view_of
 from saccade.services.perception.seen import Modes, Seen, bits
 from saccade.shared.config import WEIGHTS, Config
 from saccade.shared.model.weights import Weights
@@ -184,12 +184,13 @@ def test_networks_that_draw_are_those_with_latent_poses(monkeypatch):
     latents[1] = 1.0
     nothing = RedThings().see(np.full((60, 60, 3), RED, np.uint8), INTRINSICS_PX, (0.0, 1.0, 0.0))
     told = dataclasses.replace(nothing, latent_mean=latents)
-    first, second = (drawing_of(weights, "soup_can", told, k) for k in (0, 1))
+    decoder = decoder_of(weights, "soup_can")
+    first, second = (drawing_of(decoder, told, k) for k in (0, 1))
     assert first.shape == (64, 64, 3)
     assert first.dtype == np.uint8
     assert not np.array_equal(first, second)
     monkeypatch.setattr(weights, "architecture", "posecnn")
-    assert drawing_of(weights, "soup_can", told, 0) is None
+    assert drawing_of(decoder_of(weights, "soup_can"), told, 0) is None
 
 
 # --- how objects are turned

@@ -23,6 +23,7 @@ from saccade.app.run.registry import AGENTS, agent_of
 from saccade.app.run.threads import limit_torch
 from saccade.services.perception.core import Model, model_of
 from saccade.services.perception.seen import Seen
+from saccade.shared.bus.messages import mask_of
 from saccade.shared.config import Config, load
 from saccade.shared.errors import LINE_LIMIT, SaccadeError, printable
 from saccade.shared.files import replace_whole, writing
@@ -42,7 +43,7 @@ class Looker:
     """The networks of an agent, for photographs. Raises SaccadeError if the agent has no networks that find objects, or
     if their weights are missing or damaged."""
 
-    def __init__(self, config: Config, agent: str) -> None:
+    def __init__(self, config: Config, agent: str, *, draw: bool = True) -> None:
         if "perception" not in agent_of(agent).services or config.services.perception is not None:
             able = [name for name, other in AGENTS.items() if "perception" in other.services
                     and load(None, other.preset).services.perception is None]
@@ -53,6 +54,7 @@ class Looker:
         self.weights = Weights(config.weights)
         self.model: Model = model_of(self.weights, self.names, config.perception.passes)
         self.square: bool = getattr(self.model, "square", True)  # whether the networks take square images only
+        self._decoders = {name: decoder_of(self.weights, name) for name in self.names if draw}
 
     def look(self, photo: Photograph) -> Look:
         """Looks at a photograph."""
@@ -65,10 +67,9 @@ class Looker:
         range_m = REFERENCE_RANGE_M / float(seen.scale[k])
         if self.weights.architecture in ONE_FOCAL_LENGTH:
             range_m *= image.intrinsics_px[0] / image.rgb.shape[1] * IMAGE_SIZE_PX / INTRINSICS_PX[0]
-        cells = len(seen.mask_bits[k])
-        grid = np.unpackbits(seen.mask_bits[k], axis=1)[:, :cells].astype(bool)
+        grid = mask_of(seen.mask_bits[k])
         return Sight(self.names[k], float(seen.presence[k]), image.back(seen.pixel[k]), range_m,
-                     view_of(seen, k, image), grid, drawing_of(self.weights, self.names[k], seen, k))
+                     view_of(seen, k, image), grid, drawing_of(self._decoders.get(self.names[k]), seen, k))
 
 
 def view_of(seen: Seen, k: int, image: Fitted) -> tuple[float, float] | None:
@@ -87,12 +88,17 @@ def view_of(seen: Seen, k: int, image: Fitted) -> tuple[float, float] | None:
     return math.degrees(azimuth), math.degrees(elevation)
 
 
-def drawing_of(weights: Weights, name: str, seen: Seen, k: int) -> NDArray[np.uint8] | None:
-    """How the networks imagine object k [64, 64, 3]: the mean of its latent pose, decoded. None if they draw
-    nothing."""
-    if weights.architecture not in WITH_LATENTS:
+def decoder_of(weights: Weights, name: str) -> LatentDecoder | None:
+    """What draws an object. None if networks of this architecture draw nothing."""
+    return LatentDecoder(weights, name) if weights.architecture in WITH_LATENTS else None
+
+
+def drawing_of(decoder: LatentDecoder | None, seen: Seen, k: int) -> NDArray[np.uint8] | None:
+    """How the networks imagine object k [64, 64, 3]: the mean of its latent pose, decoded. None if there is no
+    decoder."""
+    if decoder is None:
         return None
-    crop = LatentDecoder(weights, name)(seen.latent_mean[k]).clip(0, 1).transpose(1, 2, 0)
+    crop = decoder(seen.latent_mean[k]).clip(0, 1).transpose(1, 2, 0)
     drawn: NDArray[np.uint8] = (crop * 255 + 0.5).astype(np.uint8)
     return drawn
 
@@ -106,7 +112,7 @@ def see(paths: Sequence[Path], config: Config, *, agent: str, intrinsics_px: Seq
     networks, the file or the folder cannot be used.
     """
     _require_places(paths, json_file, out)
-    looker = Looker(config, agent)
+    looker = Looker(config, agent, draw=out is not None)
     entries: list[dict[str, Any]] = []
     taken = {os.path.realpath(path) for path in paths}
     failed = 0

@@ -22,12 +22,11 @@ from saccade.shared.config import Config
 from saccade.shared.errors import LINE_LIMIT, SaccadeError, printable
 from saccade.shared.log.folder import CONFIG_NAME, LOG_NAME, LOGS_NAME
 from saccade.shared.log.reading import is_whole
-from saccade.shared.loop.episodes import READY_STATES
+from saccade.shared.loop.episodes import READY_STATES, RECORDER
 from saccade.shared.loop.process import Item
 from saccade.shared.render.objects import names_of
 
 CONNECT_S = 10.0  # a router on this machine answers at once
-RECORDER = "recorder"
 
 # The router, then the others in the order in which the data passes them.
 ROUTER, *SERVICES = PROCESSES = tuple(Process(name, f"saccade.services.{name}") for name in (

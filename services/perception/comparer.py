@@ -46,3 +46,9 @@ class Compared:
         self.same, self.shift, self.log_ratio = raw[:, 0], raw[:, 1:3], raw[:, 3]
         self.turn, self.roll = raw[:, 4:6], raw[:, 6]
         self.log_std = raw[:, 7:11].clamp(-5.0, 1.0)
+
+    @property
+    def deviation(self) -> Tensor:
+        """The standard deviations [B, 4], double precision: those of Laplace distributions with the scales
+        exp(log_std)."""
+        return 2.0 ** 0.5 * self.log_std.exp().double()

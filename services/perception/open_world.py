@@ -18,12 +18,12 @@ from torch import Tensor
 from saccade.services.perception.bank import FILLED, Bank, bank_of
 from saccade.services.perception.comparer import Compared, Comparison
 from saccade.services.perception.cropping import Cropper
-from saccade.services.perception.proposer import Proposals, Proposer, propose
+from saccade.services.perception.proposer import Proposals, Proposer, half_tangent, propose
 from saccade.services.perception.seen import Modes, Seen, bits
 from saccade.services.perception.view_encoder import ViewEncoder
 from saccade.shared.errors import SaccadeError
 from saccade.shared.model.weights import Weights
-from saccade.shared.world.geometry import REFERENCE_RANGE_M, pixel_rays, pose, rotation_towards, unit
+from saccade.shared.world.geometry import REFERENCE_RANGE_M, pixel_rays, pose, project, rotation_towards, unit
 from saccade.shared.world.windows import Window, upright
 
 INPUT_PX = 320  # the longer side of the image that the proposer sees
@@ -176,7 +176,7 @@ class OpenWorld:
         fx = float(np.asarray(intrinsics_px)[0])
         pixels = found.center.double().numpy() * (right, down)
         ahead = np.maximum(-pixel_rays(pixels, intrinsics_px)[:, 2], 1e-3)
-        tangent = found.half.double().numpy() * right / fx * ahead ** 1.5
+        tangent = half_tangent(found.radius.double().numpy() * right, ahead, fx)
         window = Window(pixels, np.ones(len(found)), 2 * REFERENCE_RANGE_M * tangent / FILLED)
         cropper = Cropper(image, found.masks, intrinsics_px, up)
         if not len(found):
@@ -200,11 +200,9 @@ class Placed:
         tangent = compared.shift[row].double().numpy() * half - aside
         rotation = upright(pixel_rays(window.pixels[match.thing, None], intrinsics_px), self.up)[0]
         self.ray = unit(rotation @ np.array([tangent[0], -tangent[1], -1.0]))
-        fx, fy, cx, cy = np.asarray(intrinsics_px, dtype=np.float64)
-        ahead = max(-self.ray[2], 1e-3)
-        self.pixel = np.array([cx + fx * self.ray[0] / ahead, cy - fy * self.ray[1] / ahead])
-        deviation = np.sqrt(2.0) * compared.log_std[row].exp().double().numpy()  # of a Laplace distribution's scale
-        self.pixel_std, self.log_scale_std = float(deviation[0] * half * fx), float(deviation[1])
+        self.pixel = project(self.ray, np.eye(4), intrinsics_px)[0]
+        shift_std, self.log_scale_std = compared.deviation[row, :2].tolist()
+        self.pixel_std = float(shift_std * half * np.asarray(intrinsics_px)[0])
 
     def modes(self, similar: Tensor, compared: list[tuple[int, int]], sharpness: float) -> Modes:
         """How the object may be turned, by the similarities [V] to its views, of which some were `compared` (view,
@@ -222,8 +220,7 @@ class Placed:
             weights.append(float(share[cap].sum()))
             share = np.where(cap, 0.0, share)
         rest = np.argsort(-share)[:MODES - len(compared)]
-        deviation = np.concatenate([np.sqrt(2.0) * self.compared.log_std[rows, 2].exp().double().numpy(),
-                                    np.full(len(rest), VIEW_STD_RAD)])
+        deviation = np.concatenate([self.compared.deviation[rows, 2], np.full(len(rest), VIEW_STD_RAD)])
         weight = np.maximum(np.concatenate([weights, share[rest]]), 1e-12)
         order = np.argsort(-weight)
         camera = upright(self.ray[None], self.up)[0]

@@ -8,18 +8,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 import torch.nn.functional as F
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from saccade.services.perception.networks import block
 
 STRIDE = 4  # pixels of the image per cell of the maps
+OBLIQUE = 1.5  # exponent of the cosine: the mean of 2 along a radius of the image, and 1 across
 REACH = 64.0  # pixels: unit of the votes for the centre
 MOST = 12  # proposals in an image
 FOREGROUND = 0.5  # cells that are likelier than this to show a thing count when proposals are found
-NEAR = 0.35  # votes within this share of a thing's half side of its centre are for it
-SUPPORT = 0.08  # least share of a thing's square that its voters cover
+NEAR = 0.35  # votes within this share of a thing's radius of its centre are for it
+SUPPORT = 0.08  # least share of the square around a thing's circle that its voters cover
 PIXELS = 12.0  # least number of voters, in cells
 OVERLAP = 0.5  # of two things whose voters are the same to this share, the one with fewer is none
 
@@ -32,8 +35,8 @@ def _normal(channels_in: int, channels_out: int, stride: int = 1, dilation: int 
 
 class Proposer(nn.Module):
     """Image [B, 3, H, W] with sides that 16 divides -> a logit of the foreground [B, H/4, W/4] and votes
-    [B, 3, H/4, W/4]: the offset (du, dv) of the centre of the thing's square from the cell, in pixels, and the log of
-    half its side in pixels."""
+    [B, 3, H/4, W/4]: the offset (du, dv) of the centre of the circle around the thing from the cell, in pixels, and the
+    log of its radius in pixels."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -56,16 +59,26 @@ class Proposer(nn.Module):
 
 @dataclass(frozen=True)
 class Proposals:
-    """P things in an image: centres of their squares (u, v) [P, 2] and half sides [P] in pixels of the network's image,
-    the shares of the squares that their voters cover [P], and masks [P, H/4, W/4] from 0 to 1."""
+    """P things in an image: centres (u, v) [P, 2] and radii [P] of the circles around them, in pixels of the network's
+    image, and masks [P, H/4, W/4] from 0 to 1."""
 
     center: Tensor
-    half: Tensor
-    support: Tensor
+    radius: Tensor
     masks: Tensor
 
     def __len__(self) -> int:
-        return len(self.half)
+        return len(self.radius)
+
+
+def half_tangent(radius_px: NDArray[np.float64], ahead: NDArray[np.float64], focal_px: float) -> NDArray[np.float64]:
+    """The tangents of the angles whose circles have these radii in the image. `ahead` are the cosines between the rays
+    to their centres and the optical axis: off the axis a circle is drawn out."""
+    return radius_px / focal_px * ahead ** OBLIQUE
+
+
+def radius_px(half_tangent: NDArray[np.float64], ahead: NDArray[np.float64], focal_px: float) -> NDArray[np.float64]:
+    """The inverse of `half_tangent`."""
+    return half_tangent * focal_px / ahead ** OBLIQUE
 
 
 def places(height: int, width: int) -> Tensor:
@@ -87,11 +100,11 @@ def propose(foreground: Tensor, votes: Tensor) -> Proposals:
     votes = votes.flatten(1)[:, voters]
     weight = share.flatten()[voters]
     aimed = place + votes[:2]  # [2, N]
-    half = votes[2].exp()
-    found: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
-    left, reach = weight.clone(), (NEAR * half).clamp(min=2.0 * STRIDE)  # a peak is known to about a cell
+    radius = votes[2].exp()
+    found: list[tuple[Tensor, Tensor, Tensor]] = []
+    left, reach = weight.clone(), (NEAR * radius).clamp(min=2.0 * STRIDE)  # a peak is known to about a cell
     while len(voters) and len(found) < MOST and float(left.sum()) >= PIXELS:
-        center = _peak(aimed, left, half, height, width)
+        center = _peak(aimed, left, radius, height, width)
         for _ in range(2):  # of all voters near it, also of those that count for another peak
             near = ((aimed - center[:, None]) ** 2).sum(0) < reach ** 2
             mine = weight * near
@@ -104,25 +117,22 @@ def propose(foreground: Tensor, votes: Tensor) -> Proposals:
             if float(taken.sum()) < 1.0:  # a peak of nobody: take its strongest voter away, so that this ends
                 left[int(left.argmax())] = 0.0
             continue
-        size = ((half.log() * mine).sum() / mine.sum()).exp()
-        support = mine.sum() * STRIDE ** 2 / (4 * size ** 2)
-        if float(support) < SUPPORT:
+        size = ((radius.log() * mine).sum() / mine.sum()).exp()
+        if float(mine.sum() * STRIDE ** 2 / (4 * size ** 2)) < SUPPORT:
             continue
         mask = torch.zeros(height * width).index_put((voters,), mine)
-        found.append((center, size, support, mask.view(height, width)))
+        found.append((center, size, mask.view(height, width)))
     if not found:
-        nothing = torch.zeros(0)
-        return Proposals(torch.zeros(0, 2), nothing, nothing, torch.zeros(0, height, width))
-    center, size, support, mask = (torch.stack(part) for part in zip(*found, strict=True))
-    return Proposals(center, size, support, mask)
+        return Proposals(torch.zeros(0, 2), torch.zeros(0), torch.zeros(0, height, width))
+    return Proposals(*(torch.stack(part) for part in zip(*found, strict=True)))
 
 
-def _peak(aimed: Tensor, weight: Tensor, half: Tensor, height: int, width: int) -> Tensor:
+def _peak(aimed: Tensor, weight: Tensor, radius: Tensor, height: int, width: int) -> Tensor:
     """Where most votes are [2], in pixels. The votes of large things spread farther and count less each."""
     cell = (aimed / STRIDE).long() + 8  # centres may lie outside of the image
     inside = ((cell >= 0) & (cell < torch.tensor([width + 16, height + 16])[:, None])).all(0)
     index = cell[1] * (width + 16) + cell[0]
-    counts = torch.bincount(index[inside], (weight / half)[inside], minlength=(height + 16) * (width + 16))
+    counts = torch.bincount(index[inside], (weight / radius)[inside], minlength=(height + 16) * (width + 16))
     smooth = F.avg_pool2d(counts.view(1, 1, height + 16, width + 16), 3, 1, 1).flatten()
     best = int(smooth.argmax())
     return torch.tensor([(best % (width + 16) - 8 + 0.5) * STRIDE, (best // (width + 16) - 8 + 0.5) * STRIDE])

@@ -16,7 +16,7 @@ from pathlib import Path
 from saccade.services.recorder.whole import Patience, Whole
 from saccade.shared.bus.messages import Message, Status
 from saccade.shared.bus.outbox import KEPT_BYTES
-from saccade.shared.bus.sequences import Key, Sequences
+from saccade.shared.bus.sequences import Sequences
 from saccade.shared.bus.topics import RESULT, TOPICS, Topic
 from saccade.shared.bus.transport import Bus, LocalBus, ZenohBus
 from saccade.shared.bus.wire import MessageError, decode
@@ -71,7 +71,6 @@ class Recorder:
     def __init__(self, bus: Bus, folder: Path, config: Config) -> None:
         self.health, self._bus, self._run = Health(NAME), bus, config.run or folder.name
         self._sequences = Sequences(from_start=True, cut=config.bus.first_step > 0)
-        self._last: dict[Key, tuple[int, int]] = {}  # newest (episode, step) of each key
         self._names = config.scene.names or ()
         self._left_out: set[str] = set()  # reasons for which the log did not take messages, each told once
         self._finished, self._invalid_bytes = False, 0
@@ -163,7 +162,7 @@ class Recorder:
         is_own = message is not None and message.run == self._run and self._ahead(topic, message) is None
         if is_own and message is not None and self._sequences.begins(topic, part, message):
             # A new episode begins. The last messages of the episode before may be lost, so they are asked for.
-            self._write_kept([topic], self._last.get((topic.name, part), (message.episode, 0)))
+            self._write_kept([topic], self._whole.last.get((topic.name, part), (message.episode, 0)))
         self._write(self.log, topic, part, payload, message)
         self.health.published = self.log.messages
         self._ask_for_missing()
@@ -187,7 +186,7 @@ class Recorder:
 
     def _ask_for_news(self) -> None:
         """Asks for the newest messages. If the newest is lost, there is no later one whose number would show this."""
-        episode, step = max(self._last.values(), default=(0, 0))
+        episode, step = max(self._whole.last.values(), default=(0, 0))
         self._write_kept([t for t in TOPICS.values() if t.in_step and not t.latched], (episode, max(0, step - 1)))
         self._ask_for_held(episode)
 
@@ -253,9 +252,6 @@ class Recorder:
                 return
             if lost and time_ns is None:  # the missing ones come first, so that the log is in order
                 self._ask_for_missing()
-            if topic.in_step and message.run == self._run:
-                key = topic.name, part
-                self._last[key] = max(self._last.get(key, (0, 0)), (message.episode, message.step))
         log.write(topic, part, payload, sequence=message.seq if message else 0, log_time_ns=time_ns)
 
     def _strange(self, topic: Topic, part: str | None, message: Message) -> str | None:

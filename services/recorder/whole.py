@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable
 
 from saccade.shared.bus.messages import Message, Status, Truth
+from saccade.shared.bus.sequences import Key
 from saccade.shared.bus.topics import RESULT, TOPICS, Topic
 
 SILENT_S = 2.0  # a service that was not heard for this time hangs or is starting again
@@ -22,11 +23,11 @@ class Whole:
     def __init__(self, run: str, services: set[str] | None) -> None:
         self._run, self._services = run, services
         self.episode = 0
-        self._last: dict[tuple[str, str | None], tuple[int, int]] = {}  # newest (episode, step) of each key
+        self.last: dict[Key, tuple[int, int]] = {}  # newest (episode, step) of each key
         self._heard: dict[str | None, tuple[int, int]] = {}  # of each service
         self._steps: dict[int, int] = {}  # the last step of each episode that is done
         self._results: set[int] = set()
-        self._seldom: set[tuple[str, str | None]] = set()  # keys that were waited for in vain
+        self._seldom: set[Key] = set()  # keys that were waited for in vain
 
     def take(self, topic: Topic, part: str | None, message: Message) -> None:
         """Takes a message of this run."""
@@ -40,7 +41,7 @@ class Whole:
         if isinstance(message, Truth) and message.done:
             self._steps[message.episode] = message.step
         key = topic.name, part
-        self._last[key] = max(self._last.get(key, (0, -1)), (message.episode, 0 if topic.latched else message.step))
+        self.last[key] = max(self.last.get(key, (0, -1)), at)
 
     @property
     def is_over(self) -> bool:
@@ -57,10 +58,10 @@ class Whole:
         last = self._steps[self.episode] - 1
         return self.episode > 0 or all(self._heard.get(name, (0, -1)) >= (0, last) for name in self._services or ())
 
-    def _lacking(self) -> set[tuple[str, str | None]]:
-        """The keys that did not come as far as the episode did. A latched message counts as one of step 0."""
+    def _lacking(self) -> set[Key]:
+        """The keys that did not come as far as the episode did. A latched message may have any step."""
         last = self._steps.get(self.episode, 0) - 1
-        return {key for key, at in self._last.items() if key not in self._seldom
+        return {key for key, at in self.last.items() if key not in self._seldom
                 and at < (self.episode, 0 if TOPICS[key[0]].latched else last)}
 
     def give_up(self) -> None:

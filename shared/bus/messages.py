@@ -45,6 +45,11 @@ class Message(metaclass=type):  # noqa: UP050 - without it mypy says that its cl
 AnyMessage = TypeVar("AnyMessage", bound=Message)
 
 
+def mask_of(mask_bits: np.ndarray) -> np.ndarray:
+    """Truth values [M, M] of a mask whose rows of cells are packed into bytes [M, B]."""
+    return np.unpackbits(mask_bits, axis=1)[:, :len(mask_bits)].astype(bool)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Frame(Message):
     """What the camera sees."""
@@ -114,7 +119,7 @@ class Percept(Message):
         """Where in the image the object is seen: truth values [M, M]. None if the message has no mask."""
         if self.mask_bits is None:
             return None
-        return np.unpackbits(self.mask_bits, axis=1)[:, :len(self.mask_bits)].astype(bool)
+        return mask_of(self.mask_bits)
 
 
 @dataclass(frozen=True, kw_only=True)

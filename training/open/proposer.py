@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from saccade.services.perception.proposer import STRIDE, Proposer, places, propose
+from saccade.services.perception.proposer import STRIDE, Proposer, places, propose, radius_px
+from saccade.shared.world.geometry import project
 from saccade.training.open.table_crops import INTRINSICS, TableCrops
 from saccade.training.open.tables import FRAME_PX
 from saccade.training.settings import TrainingConfig
@@ -87,7 +88,7 @@ class ProposerTask:
             taken = torch.zeros(len(proposals), dtype=torch.bool)
             for circle, seen in zip(circles, visible, strict=True):
                 off = (proposals.center - circle[:2]).norm(dim=1) / circle[2]
-                larger = (proposals.half / circle[2]).log().abs()
+                larger = (proposals.radius / circle[2]).log().abs()
                 good = (off < NEAR) & (larger < NEAR)
                 taken |= (off < 2 * NEAR) & (larger < 2 * NEAR)
                 if float(seen) > WHOLE:
@@ -114,11 +115,9 @@ class ProposerTask:
 
 def circles_px(crops: TableCrops) -> NDArray[np.float64]:
     """The circles [N, 3] of sights in the frames: centre (u, v) and radius in pixels."""
-    fx, fy, cx, cy = INTRINSICS
     ray = -crops.sights.rotation[:, :, 2]
-    ahead = np.maximum(-ray[:, 2], 1e-3)
-    center = np.stack([cx + fx * ray[:, 0] / ahead, cy - fy * ray[:, 1] / ahead], axis=1)
-    return np.concatenate([center, (crops.sights.half_tangent * fx / ahead ** 1.5)[:, None]], axis=1)
+    center, ahead = project(ray, np.eye(4), INTRINSICS)
+    return np.concatenate([center, radius_px(crops.sights.half_tangent, ahead, INTRINSICS[0])[:, None]], axis=1)
 
 
 def images(crops: TableCrops, circles: NDArray[np.float64], chosen: NDArray[np.int64], rng: np.random.Generator,
