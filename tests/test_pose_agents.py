@@ -93,7 +93,7 @@ def test_the_loss_of_a_symmetric_object_forgives_what_looks_alike():
 
 
 def test_the_labels_of_a_rendered_image_are_the_poses_of_its_objects():
-    scenes = RenderedScenes([load_mesh("pantry", name) for name in NAMES], torch.device("cpu"))
+    scenes = RenderedScenes([load_mesh("pantry", name) for name in NAMES])
     batch = scenes.compose(6, np.random.default_rng(1))
     rng, checked = np.random.default_rng(1), 0
     for n in range(6):

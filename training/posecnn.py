@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import functools
+import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+from torch.utils.data import DataLoader, Dataset
 
 from saccade.services.perception.posecnn import (
     CELLS,
@@ -31,6 +35,7 @@ VOTING, ROTATION = 2.0, 4.0  # weights of the losses beside that of the labels
 JITTER = 0.08  # of the regions in training, in shares of their side: as wrong as the votes' centres
 FOCAL_WIDTHS = INTRINSICS_PX[0] / IMAGE_SIZE_PX  # the focal length in image widths
 EVALUATED = 100  # number of images in an evaluation
+AHEAD = 6  # processes that render for a GPU
 
 
 class PoseCnnTask:
@@ -39,7 +44,8 @@ class PoseCnnTask:
     def __init__(self, config: TrainingConfig, device: torch.device):
         torch.manual_seed(config.seed)
         meshes = [load_mesh(config.objects, name) for name in config.names]
-        self.scenes = RenderedScenes(meshes, device)
+        self.scenes = RenderedScenes(meshes)
+        self.ahead: Iterator[RenderedBatch] | None = None
         self.module = on_device(PoseNetwork(len(meshes)), device)
         self.config, self.device = config, device
         self.lambdas: list[float] = []
@@ -52,11 +58,19 @@ class PoseCnnTask:
         self.symmetric = torch.tensor([name in config.symmetric for name in config.names], device=device)
 
     def _batch(self, count: int, step: int) -> RenderedBatch:
-        return self.scenes.compose(count, np.random.default_rng([self.config.seed, step]))
+        return self.scenes.compose(count, np.random.default_rng([self.config.seed, step])).to(self.device)
+
+    def _next(self, step: int) -> RenderedBatch:
+        """The batch of a step. A GPU would wait for it, so other processes render ahead."""
+        if self.device.type == "cpu":
+            return self._batch(self.config.batch_extraction, step)
+        if self.ahead is None:
+            self.ahead = rendered_ahead(self.config, step, max(1, min(AHEAD, (os.cpu_count() or 2) - 1)))
+        return next(self.ahead).to(self.device)
 
     def loss(self, step: int) -> tuple[Tensor, dict[str, float]]:
         """The loss at a step, and its parts."""
-        batch = self._batch(self.config.batch_extraction, step)
+        batch = self._next(step)
         generator = torch.Generator(self.device).manual_seed(step)
         with torch.autocast(self.device.type, dtype=torch.bfloat16):
             labels, votes, features = self.module(batch.input.contiguous(memory_format=torch.channels_last))
@@ -113,6 +127,31 @@ class PoseCnnTask:
         """Saves sample pictures."""
         batch = self._batch(6, 2 ** 31)
         draw_poses(path, batch, self.module(batch.input)[0])
+
+
+class Batches(Dataset[RenderedBatch]):
+    """The batches of a training run from a step on, rendered where they are asked for."""
+
+    def __init__(self, config: TrainingConfig, start: int):
+        self.config, self.start = config, start
+
+    @functools.cached_property
+    def scenes(self) -> RenderedScenes:
+        """What renders, in the process that asks for it."""
+        return RenderedScenes([load_mesh(self.config.objects, name) for name in self.config.names])
+
+    def __len__(self) -> int:
+        return self.config.steps_extraction - self.start
+
+    def __getitem__(self, number: int) -> RenderedBatch:
+        rng = np.random.default_rng([self.config.seed, self.start + number])
+        return self.scenes.compose(self.config.batch_extraction, rng)
+
+
+def rendered_ahead(config: TrainingConfig, start: int, workers: int) -> Iterator[RenderedBatch]:
+    """The batches of the steps from `start` on, in their order, which `workers` processes render."""
+    return iter(DataLoader(Batches(config, start), batch_size=None, num_workers=workers,
+                           multiprocessing_context="spawn"))
 
 
 def vote_loss(votes: Tensor, batch: RenderedBatch) -> Tensor:

@@ -42,12 +42,16 @@ class RenderedBatch:
     rotation: Tensor
     seen: Tensor
 
+    def to(self, device: torch.device) -> RenderedBatch:
+        """The same batch on a device."""
+        return RenderedBatch(*(value.to(device) for value in vars(self).values()))
+
 
 class RenderedScenes:
     """Renders scenes of objects on a table with the simulator. Raises SaccadeError if OpenGL does not work."""
 
-    def __init__(self, meshes: list[Mesh], device: torch.device):
-        self.names, self.device = [mesh.name for mesh in meshes], device
+    def __init__(self, meshes: list[Mesh]):
+        self.names = [mesh.name for mesh in meshes]
         intrinsics = np.array(INTRINSICS_PX) * INPUT_PX / IMAGE_SIZE_PX
         self.world = World(tuple(meshes), size_px=INPUT_PX, intrinsics_px=intrinsics)
         self.scenes = TableScenes([mesh.size_m for mesh in meshes], len(meshes))
@@ -80,5 +84,6 @@ class RenderedScenes:
         entered[:, 3:] *= kept
         small = torch.as_tensor(label[:, ::INPUT_PX // LABEL_PX, ::INPUT_PX // LABEL_PX].astype(np.int64))
         seen = F.one_hot(small, k + 1).sum((1, 2))[:, 1:]
-        tensors = [torch.as_tensor(x, dtype=torch.float32) for x in (center, log_scale, rotation)]
-        return RenderedBatch(*(x.to(self.device) for x in (entered, small, *tensors, seen)))
+        center_, log_scale_, rotation_ = (torch.as_tensor(x, dtype=torch.float32)
+                                          for x in (center, log_scale, rotation))
+        return RenderedBatch(entered, small, center_, log_scale_, rotation_, seen)

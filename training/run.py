@@ -71,7 +71,7 @@ def train(run_dir: Path, config: TrainingConfig, *, jobs: int, console: Console)
 
         if config.architecture == "open":
             if config.parts:
-                prepare(run_dir, config, show)
+                prepare(run_dir, config, show, jobs)
         elif config.architecture not in WHOLE:  # which render their own images
             render_missing(run_dir, config, lambda name, done, total: show(f"views {name}", done, total))
         _train_parts(run_dir, config, jobs, show)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from saccade.services.perception.networks import block
+from saccade.services.perception.networks import block, normed
 
 OUTPUTS = 11
 
@@ -21,9 +21,9 @@ class Comparison(nn.Module):
         super().__init__()
         self.seen = nn.Sequential(block(7, width, stride=2), block(width, width))
         self.known = nn.Sequential(block(4, width, stride=2), block(width, width))
-        self.both = nn.Sequential(block(3 * width, 2 * width, stride=2), block(2 * width, 2 * width),
-                                  block(2 * width, 3 * width, stride=2), block(3 * width, 3 * width),
-                                  block(3 * width, 4 * width, stride=2), nn.Flatten(),
+        self.both = nn.Sequential(normed(3 * width, 2 * width, stride=2), normed(2 * width, 2 * width),
+                                  normed(2 * width, 3 * width, stride=2), normed(3 * width, 3 * width),
+                                  normed(3 * width, 4 * width, stride=2), nn.Flatten(),
                                   nn.Linear(4 * width * 16, 256), nn.LeakyReLU(0.1), nn.Linear(256, OUTPUTS))
 
     def forward(self, seen: Tensor, known: Tensor) -> Tensor:

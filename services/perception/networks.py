@@ -22,6 +22,12 @@ def block(channels_in: int, channels_out: int, stride: int = 1, dilation: int = 
                          nn.LeakyReLU(0.1))
 
 
+def normed(channels_in: int, channels_out: int, stride: int = 1, dilation: int = 1) -> nn.Sequential:
+    """A convolution whose outputs are normalised, so that training needs fewer steps."""
+    return nn.Sequential(nn.Conv2d(channels_in, channels_out, 3, stride, padding=dilation, dilation=dilation),
+                         nn.GroupNorm(8, channels_out), nn.LeakyReLU(0.1))
+
+
 class Extraction(nn.Module):
     """The extraction network: image [B, 3, 120, 120] -> masks of K objects, and votes for their centre and scale.
 

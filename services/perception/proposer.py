@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from saccade.services.perception.networks import block
+from saccade.services.perception.networks import block, normed
 
 STRIDE = 4  # pixels of the image per cell of the maps
 OBLIQUE = 1.5  # exponent of the cosine: the mean of 2 along a radius of the image, and 1 across
@@ -27,12 +27,6 @@ PIXELS = 12.0  # least number of voters, in cells
 OVERLAP = 0.5  # of two things whose voters are the same to this share, the one with fewer is none
 
 
-def _normal(channels_in: int, channels_out: int, stride: int = 1, dilation: int = 1) -> nn.Sequential:
-    """A convolution whose outputs are normalised, so that training needs fewer steps."""
-    return nn.Sequential(nn.Conv2d(channels_in, channels_out, 3, stride, padding=dilation, dilation=dilation),
-                         nn.GroupNorm(8, channels_out), nn.LeakyReLU(0.1))
-
-
 class Proposer(nn.Module):
     """Image [B, 3, H, W] with sides that 16 divides -> a logit of the foreground [B, H/4, W/4] and votes
     [B, 3, H/4, W/4]: the offset (du, dv) of the centre of the circle around the thing from the cell, in pixels, and the
@@ -40,12 +34,12 @@ class Proposer(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.stem = nn.Sequential(block(3, 24, stride=2), _normal(24, 32, stride=2), _normal(32, 32))
-        self.middle = nn.Sequential(_normal(32, 64, stride=2), _normal(64, 64))
-        self.deep = nn.Sequential(_normal(64, 96, stride=2), _normal(96, 96), _normal(96, 96, dilation=2),
-                                  _normal(96, 96, dilation=4), _normal(96, 96, dilation=8), _normal(96, 64))
-        self.merge = _normal(128, 64)
-        self.fine = nn.Sequential(_normal(96, 48), nn.Conv2d(48, 4, 1))
+        self.stem = nn.Sequential(block(3, 24, stride=2), normed(24, 32, stride=2), normed(32, 32))
+        self.middle = nn.Sequential(normed(32, 64, stride=2), normed(64, 64))
+        self.deep = nn.Sequential(normed(64, 96, stride=2), normed(96, 96), normed(96, 96, dilation=2),
+                                  normed(96, 96, dilation=4), normed(96, 96, dilation=8), normed(96, 64))
+        self.merge = normed(128, 64)
+        self.fine = nn.Sequential(normed(96, 48), nn.Conv2d(48, 4, 1))
 
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
         fine = self.stem(image - 0.5)

@@ -25,8 +25,7 @@ from saccade.training.tasks import generator_of
 
 EPISODE, SEQUENCE = 50, 25  # steps of an episode; images of a piece that is learnt from
 FIRST = 8  # episodes before the first step of learning
-EVERY = 20  # steps of learning between two episodes
-STARTS = 192  # states from which each policy imagines
+STARTS = 12  # of the states of each piece, from which each policy imagines
 
 
 class LexaTask:
@@ -37,12 +36,12 @@ class LexaTask:
         self.config, self.part, self.device, self.folder = config, part, device, folder
         self.module = Learner().to(device)
         self.room = Room(config.objects, config.names, folder, EPISODE)
-        self.replay = Replay(folder / "episodes", _episodes_at(step))
+        self.replay = Replay(folder / "episodes", self._episodes_at(step))
         self.lambdas: list[float] = []
 
     def loss(self, step: int) -> tuple[Tensor, dict[str, float]]:
         """The loss at a step, and its parts. Before some steps an episode is lived through."""
-        while len(self.replay.episodes) < _episodes_at(step + 1):
+        while len(self.replay.episodes) < self._episodes_at(step + 1):
             self._live(len(self.replay.episodes))
         rng = np.random.default_rng([self.config.seed, step])
         generator = generator_of(self.config, self.part, self.device, step)
@@ -66,7 +65,8 @@ class LexaTask:
     def _starts(self, states: State, encodings: Tensor, generator: torch.Generator) -> tuple[State, Tensor]:
         """States to imagine from, and as many goals: images from anywhere in the same pieces of episodes."""
         everywhere = states.deterministic.shape[0] * states.deterministic.shape[1]
-        chosen, wanted = (torch.randint(everywhere, (STARTS,), generator=generator, device=self.device)
+        count = STARTS * states.deterministic.shape[0]
+        chosen, wanted = (torch.randint(everywhere, (count,), generator=generator, device=self.device)
                           for _ in range(2))
         start = State(*(part.detach().flatten(0, 1)[chosen] for part in states))
         return start, encodings.detach().view(-1, EMBEDDED)[wanted]
@@ -108,7 +108,6 @@ class LexaTask:
         seen = learner.decoder(states.feature[0])
         draw_rows(path, [batch.images[0], seen, torch.cat([seen[:13], torch.stack(imagined)])])
 
-
-def _episodes_at(step: int) -> int:
-    """How many episodes have been lived through before a step of learning is done."""
-    return FIRST + step // EVERY if step else 0
+    def _episodes_at(self, step: int) -> int:
+        """How many episodes have been lived through before a step of learning is done."""
+        return FIRST + step // self.config.live_every if step else 0

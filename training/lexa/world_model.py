@@ -55,7 +55,8 @@ class Learner(nn.Module):
 def sampled(log_shares: Tensor, generator: torch.Generator) -> Tensor:
     """A sample of each variable as ones and zeros [B, 256], with the gradient of the probabilities."""
     shares = log_shares.exp()
-    drawn = torch.multinomial(shares.flatten(0, -2), 1, generator=generator)[:, 0].view(shares.shape[:-1])
+    uniform = torch.rand(shares.shape, generator=generator, device=shares.device)
+    drawn = (log_shares.detach() - (-uniform.clamp(min=1e-20).log()).log()).argmax(-1)  # the Gumbel-max trick
     return (F.one_hot(drawn, CLASSES) + shares - shares.detach()).flatten(-2)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -12,23 +13,26 @@ from torch import Tensor
 from saccade.services.perception.comparer import Compared, Comparison
 from saccade.services.perception.view_encoder import ViewEncoder
 from saccade.shared.world.geometry import rotation_towards
+from saccade.training.crops import warp
 from saccade.training.open.composer import Crops
-from saccade.training.open.encoder import batch
+from saccade.training.open.encoder import Banks, batch
 from saccade.training.open.material import Material
 from saccade.training.pictures import draw_pairs
 from saccade.training.settings import TrainingConfig
 from saccade.training.tasks import on_device
 
+AMONG = 4000  # views of the banks of which the most alike is drawn
+NONE = 4  # for so many crops one pair with nothing, and one with a part
 SAME_RAD, OTHER_RAD = 0.45, 0.9  # angles of views that count as the same, and as others
-ALIKE = 0.02  # mean squared difference of views that cannot be told apart, so that neither counts as another
+ALIKE = 0.005  # mean squared difference of views that cannot be told apart, so that neither counts as another
 MARGIN_RAD = 0.35  # how far known views are from the crop's direction, at most, where they are drawn near it
 OFF = 3.0  # weight of the errors of place, size and turn beside that of sameness
 EVALUATED = 400
 
 
 class ComparerTask:
-    """Trains the comparer on pairs. Half of them show the same object from about the same direction; the others show
-    what a trained encoder finds most alike among views of the batch that show something else."""
+    """Trains the comparer on pairs: the same object from about the same direction; what a trained encoder finds most
+    alike among known views of something else; and nothing, or a part, beside what it might be taken for."""
 
     def __init__(self, config: TrainingConfig, material: Material, encoder: ViewEncoder, device: torch.device):
         torch.manual_seed(config.seed)
@@ -36,6 +40,8 @@ class ComparerTask:
         self.encoder = encoder.to(device).eval()
         self.comparison = on_device(Comparison(), device)
         self.lambdas: list[float] = []
+        self.banks = Banks(self.encoder, material, range(len(material.tiles)))
+        self.strange = Banks(self.encoder, material, material.real)
 
     @property
     def module(self) -> Comparison:
@@ -45,7 +51,7 @@ class ComparerTask:
     def pairs(self, step: int, count: int) -> Pairs:
         """Pairs for a step."""
         rng = np.random.default_rng([self.config.seed, 2, step])
-        return pairs(self.material, self.encoder, batch(self.material, count, rng), rng)
+        return pairs(self.material, self.encoder, self.banks, batch(self.material, count, rng), rng)
 
     def loss(self, step: int) -> tuple[Tensor, dict[str, float]]:
         """The loss at a step, and its parts."""
@@ -63,7 +69,7 @@ class ComparerTask:
         rng = np.random.default_rng([self.config.seed, 2 ** 31])
         held = self.material.held_out
         crops = held.draw(rng.choice(len(held.sights.table), EVALUATED), rng)
-        drawn = pairs(self.material, self.encoder, crops, rng)
+        drawn = pairs(self.material, self.encoder, self.strange, crops, rng)
         compared = Compared(self.comparison(drawn.seen, drawn.known))
         same, other = drawn.label > 0.5, drawn.label < 0.5
         found = torch.cat([compared.shift, compared.log_ratio[:, None]], 1)
@@ -80,54 +86,76 @@ class ComparerTask:
         draw_pairs(path, drawn.seen, drawn.known)
 
 
+@dataclass(frozen=True)
 class Pairs:
     """B pairs: crops and known views [B, 4, 64, 64]; label [B] 1 (the same), 0 (another) or NaN (cannot be said); what
     the crop is off by [B, 4], see `Crops`; turn [B, 2], see `Compared`."""
 
-    def __init__(self, seen: Tensor, known: Tensor, label: Tensor, off: Tensor, turn: Tensor):
-        self.seen, self.known, self.label, self.off, self.turn = seen, known, label, off, turn
+    seen: Tensor
+    known: Tensor
+    label: Tensor
+    off: Tensor
+    turn: Tensor
 
 
 @torch.no_grad()
-def pairs(material: Material, encoder: ViewEncoder, crops: Crops, rng: np.random.Generator) -> Pairs:
-    """For each crop one known view from near its direction, and one of another object or from elsewhere."""
+def pairs(material: Material, encoder: ViewEncoder, banks: Banks, crops: Crops, rng: np.random.Generator) -> Pairs:
+    """For each of B crops a known view from near its direction, and the one of another object or from elsewhere that
+    the encoder finds most alike; then pairs that show no thing, or a wrong part of one."""
+    maker, device, count = material.composed, crops.seen.device, len(crops.seen)
+    generator = torch.Generator(device).manual_seed(int(rng.integers(2 ** 62)))
     which = crops.object.cpu().numpy()
-    direction = crops.direction.cpu().numpy().astype(np.float64)
-    near, turn = [], []
-    for number, towards in zip(which, direction, strict=True):
-        views = material.tiles[number].directions
-        angle = np.arccos(np.clip(views @ towards, -1, 1))
-        chosen = int(rng.choice(np.flatnonzero(angle < max(MARGIN_RAD, 1.01 * angle.min()))))
-        near.append(chosen)
-        turn.append(turn_between(views[chosen], towards))
-    mine = material.composed.known(which, np.array(near))
-    # The others: of the batch's known views, that which is most alike by the encoder and shows something else.
-    # Flat views of the crops' own directions say whether it can be told apart at all.
-    similar = encoder(crops.seen) @ encoder(crops.known).T
-    between = (crops.direction @ crops.direction.T).clamp(-1, 1).arccos()
-    close = (crops.object[:, None] == crops.object) & (between < OTHER_RAD)
-    flat = F.avg_pool2d(crops.known, 4).flatten(1)
-    alike = torch.cdist(flat, flat) ** 2 / flat.shape[1] < ALIKE / 4
-    noisy = similar - 9.0 * (close | alike) + 0.15 * torch.randn(similar.shape, generator=torch.Generator().manual_seed(
-        int(rng.integers(2 ** 62)))).to(similar.device)
-    other = noisy.argmax(1)
-    nothing = torch.zeros(len(which), 2, device=crops.seen.device)
-    turned = torch.tensor(np.array(turn), dtype=torch.float32, device=crops.seen.device)
+    angle = maker.angles(which, crops.direction)
+    near = angle <= (1.01 * angle.min(1, keepdim=True).values).clamp(min=MARGIN_RAD)
+    index = (near * torch.rand(near.shape, generator=generator, device=device)).argmax(1).cpu().numpy()
+    mine = maker.known(which, index)
+    turn = turn_between(*(each.cpu().double().numpy() for each in
+                          (maker.directions[maker.view(which, index)], crops.direction)))
+    turned = torch.tensor(turn, dtype=torch.float32, device=device)
     size = turned.norm(dim=1)
-    label = torch.where(size < SAME_RAD, 1.0, torch.where(size > OTHER_RAD, 0.0, torch.nan))
-    return Pairs(torch.cat([crops.seen, crops.seen]), torch.cat([mine, crops.known[other]]),
-                 torch.cat([label, torch.zeros_like(label)]), torch.cat([crops.off, crops.off]),
-                 torch.cat([turned, nothing]))
+    same = torch.where(size < SAME_RAD, 1.0, torch.where(size > OTHER_RAD, 0.0, torch.nan))
+
+    some = torch.randperm(len(banks.owner), generator=generator, device=device)[:AMONG]
+    close = (banks.owner[some] == crops.object[:, None]) \
+        & ((crops.direction @ banks.directions[some].T).clamp(-1, 1).arccos() < OTHER_RAD)
+    other = banks.views(some[_similar(encoder, crops.seen, banks.vectors[some]).masked_fill(close, -9.0).argmax(1)])
+    # Flat views of the same directions say whether the two can be told apart at all.
+    alike = F.avg_pool2d((crops.known - other) ** 2, 4).flatten(1).mean(1) < ALIKE
+    few = count // NONE
+    nothing = maker.nothing(few, rng)
+    for_nothing = banks.views(some[_similar(encoder, nothing, banks.vectors[some]).argmax(1)])
+    parts = misplaced(crops.seen[:few], generator)
+    none = torch.zeros(2 * few, device=device)
+    return Pairs(torch.cat([crops.seen, crops.seen, nothing, parts]), torch.cat([mine, other, for_nothing, mine[:few]]),
+                 torch.cat([same, torch.where(alike, torch.nan, 0.0), none]),
+                 torch.cat([crops.off, crops.off, torch.zeros(2 * few, 4, device=device)]),
+                 torch.cat([turned, torch.zeros(count + 2 * few, 2, device=device)]))
+
+
+def _similar(encoder: ViewEncoder, crops: Tensor, vectors: Tensor) -> Tensor:
+    with torch.autocast(crops.device.type, dtype=torch.bfloat16):
+        seen = encoder(crops)
+    return seen @ vectors.T
+
+
+def misplaced(crops: Tensor, generator: torch.Generator) -> Tensor:
+    """Crops [B, 4, 64, 64] whose circle lies around a part of the thing."""
+    count = len(crops)
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator, device=crops.device)
+
+    larger = 1.7 + 1.3 * uniform(count)
+    away = (uniform(count, 2) * 2 - 1) * (0.8 * (larger - 1))[:, None]
+    return warp(crops, away, larger, torch.zeros_like(larger))
 
 
 def turn_between(known: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """The direction [3] `seen` from the direction `known`, as an angle to the right and one up as the camera of the
-    known view sees its own motion [2] (rad)."""
-    rotation = rotation_towards(-known)
-    along = rotation.T @ seen
-    flat = along[:2]
-    length = np.linalg.norm(flat)
-    return flat / max(float(length), 1e-9) * np.arctan2(length, along[2])
+    """The directions [..., 3] `seen` from the directions `known`, as an angle to the right and one up as the cameras of
+    the known views see their own motion [..., 2] (rad)."""
+    along = np.einsum("...ji,...j->...i", rotation_towards(-known), seen)
+    length = np.linalg.norm(along[..., :2], axis=-1, keepdims=True)
+    return along[..., :2] / np.maximum(length, 1e-9) * np.arctan2(length, along[..., 2:])
 
 
 def comparing(compared: Compared, drawn: Pairs) -> tuple[Tensor, dict[str, float]]:

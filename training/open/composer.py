@@ -18,10 +18,11 @@ from saccade.services.perception.bank import FILLED
 from saccade.shared.render.surfaces import SURFACES
 from saccade.shared.world.windows import CROP_PX
 from saccade.training.crops import warp
-from saccade.training.open.tiles import Tiles
+from saccade.training.open.tiles import TILE_PX, Tiles
 
 BACKGROUNDS = 160  # surfaces that are made once
-SCALE, SHIFT, ROLL_RAD = 0.17, 0.10, 0.15  # how wrong a proposal is: log of its side, place in sides, roll
+SCALE, SHIFT = 0.17, 0.10  # how wrong a proposal is: log of its side, place in sides
+ROLL_RAD = 0.42  # things that may lie are tried in eight rolls
 BESIDE, BEFORE = 0.6, 0.35  # shares of crops with a neighbour behind or beside, and before
 AS_IT_IS = 0.6  # share of the images that a camera which acts gently leaves
 SMALL = 0.35  # share of crops that come from few pixels
@@ -52,7 +53,42 @@ class CropMaker:
     def __init__(self, tiles: list[Tiles], device: torch.device, seed: int = 0):
         self.tiles, self.device = tiles, device
         self.seed = seed
-        self.directions = [torch.tensor(t.directions, dtype=torch.float32) for t in tiles]
+        self.views = np.array([len(each.images) for each in tiles])
+        self.variants = np.array([each.images.shape[1] for each in tiles])
+        self._first = np.cumsum(self.views) - self.views  # of all views, the first of each object
+        self.directions, self.circles = (torch.tensor(np.concatenate([getattr(each, what) for each in tiles]),
+                                                      dtype=torch.float32, device=device)
+                                         for what in ("directions", "circles"))
+
+    def view(self, which: np.ndarray, index: np.ndarray | int) -> Tensor:
+        """The numbers [B] among all views, for `directions` and `circles`, of views `index` [B] of objects [B]."""
+        return torch.as_tensor(self._first[which] + index, device=self.device)
+
+    def angles(self, which: np.ndarray, towards: Tensor) -> Tensor:
+        """The angles [B, V] (rad) between the views of objects [B] and directions [B, 3]; infinite where an object has
+        fewer than V views."""
+        number = torch.arange(int(self.views.max()), device=self.device)
+        last = torch.as_tensor(self.views[which], device=self.device)[:, None]
+        views = self.directions[self.view(which, 0)[:, None] + number.minimum(last - 1)]
+        angle = (views @ towards[:, :, None])[..., 0].clamp(-1, 1).arccos()
+        return torch.where(number < last, angle, torch.inf)
+
+    @functools.cached_property
+    def _resident(self) -> Tensor:
+        """All tiles [N, 80, 80, 4] on the device, those of a view one after the other."""
+        size = int((self.views * self.variants).sum())
+        resident = torch.empty(size, TILE_PX, TILE_PX, 4, dtype=torch.uint8, device=self.device)
+        start = 0
+        for each in self.tiles:
+            images = torch.from_numpy(np.array(each.images)).flatten(0, 1)
+            resident[start:start + len(images)] = images.to(self.device)
+            start += len(images)
+        return resident
+
+    @functools.cached_property
+    def _first_tile(self) -> np.ndarray:
+        sizes = self.views * self.variants
+        return np.cumsum(sizes) - sizes
 
     @functools.cached_property
     def surfaces(self) -> Tensor:
@@ -71,17 +107,21 @@ class CropMaker:
                 roll: Tensor) -> Tensor:
         """Tiles drawn so that the circle around the outline has the centre `shift` [B, 2] and is `scale` [B] times
         as large as in a bank, turned by `roll` [B]."""
-        circles = np.stack([self.tiles[o].circles[n] for o, n in zip(which, index, strict=True)])
-        circle = torch.tensor(circles, dtype=torch.float32, device=self.device)
+        circle = self.circles[self.view(which, index)]
         size = scale * FILLED / circle[:, 2]
         cos, sin = size * roll.cos(), size * roll.sin()
         center = torch.stack([cos * circle[:, 0] - sin * circle[:, 1], sin * circle[:, 0] + cos * circle[:, 1]], 1)
         return warp(tiles, shift - center, size, roll)
 
     def tile(self, which: np.ndarray, index: np.ndarray, variant: np.ndarray) -> Tensor:
-        """Tiles [B, 4, 80, 80] from 0 to 1."""
-        chosen = np.stack([self.tiles[o].images[n, v] for o, n, v in zip(which, index, variant, strict=True)])
-        return torch.from_numpy(chosen).to(self.device).permute(0, 3, 1, 2).float() / 255.0
+        """Tiles [B, 4, 80, 80] from 0 to 1. A GPU holds all of them; otherwise they are read where they lie."""
+        if self.device.type == "cpu":
+            chosen = torch.from_numpy(np.stack([self.tiles[o].images[n, v]
+                                                for o, n, v in zip(which, index, variant, strict=True)]))
+        else:
+            number = self._first_tile[which] + index * self.variants[which] + variant
+            chosen = self._resident[torch.as_tensor(number, device=self.device)]
+        return chosen.permute(0, 3, 1, 2).float() / 255.0
 
     def draw(self, which: np.ndarray, index: np.ndarray, rng: np.random.Generator) -> Crops:
         """Crops of the objects `which` [B], seen from the directions `index` [B]."""
@@ -91,8 +131,7 @@ class CropMaker:
         def uniform(*shape: int) -> Tensor:
             return torch.rand(*shape, generator=generator, device=self.device)
 
-        variants = np.array([rng.integers(self.tiles[o].images.shape[1]) for o in which])
-        mine = self.tile(which, index, variants)
+        mine = self.tile(which, index, rng.integers(self.variants[which]))
         scale = ((uniform(count) * 2 - 1) * SCALE).exp()
         shift, roll = (uniform(count, 2) * 2 - 1) * 2 * SHIFT, (uniform(count) * 2 - 1) * ROLL_RAD
         whole = self._placed(mine, which, index, shift, scale, roll)
@@ -106,10 +145,24 @@ class CropMaker:
         mask = self.found(alpha, before[:, 3:], uniform)
         image = self.camera(image, uniform)
         known = self.known(which, index)
-        direction = torch.stack([self.directions[o][n] for o, n in zip(which, index, strict=True)]).to(self.device)
+        direction = self.directions[self.view(which, index)]
         off = torch.cat([shift, scale.log()[:, None], roll[:, None]], dim=1)
         return Crops(torch.cat([image, mask], dim=1), known, torch.as_tensor(which, device=self.device), direction,
                      visible, off)
+
+    def nothing(self, count: int, rng: np.random.Generator) -> Tensor:
+        """Crops [B, 4, 64, 64] around no thing: a mask that fits nothing in the image."""
+        generator = torch.Generator(self.device).manual_seed(int(rng.integers(2 ** 62)))
+
+        def uniform(*shape: int) -> Tensor:
+            return torch.rand(*shape, generator=generator, device=self.device)
+
+        which = rng.integers(len(self.tiles), size=count)
+        image = self._background(count, uniform)
+        beside = self._neighbour(which, rng, uniform, away=0.6)
+        image = self._over(image, beside * (uniform(count) < BESIDE)[:, None, None, None])
+        mask = self._neighbour(which, rng, uniform, away=0.0)[:, 3:]
+        return torch.cat([self.camera(image, uniform), self.found(mask, beside[:, 3:], uniform)], dim=1)
 
     @staticmethod
     def _over(below: Tensor, layer: Tensor) -> Tensor:
@@ -131,8 +184,7 @@ class CropMaker:
     def _neighbour(self, which: np.ndarray, rng: np.random.Generator, uniform, away: float = 0.35) -> Tensor:
         """Other objects [B, 4, 64, 64] at least `away` half sides from the centre."""
         others = (which + rng.integers(1, len(self.tiles), len(which))) % len(self.tiles)
-        index = np.array([rng.integers(len(self.tiles[o].images)) for o in others])
-        variant = np.array([rng.integers(self.tiles[o].images.shape[1]) for o in others])
+        index, variant = rng.integers(self.views[others]), rng.integers(self.variants[others])
         angle, far = uniform(len(which)) * 2 * np.pi, away + 0.8 * uniform(len(which))
         center = torch.stack([angle.cos() * far, angle.sin() * far], dim=1)
         return warp(self.tile(others, index, variant), center, 0.6 + 0.7 * uniform(len(which)),

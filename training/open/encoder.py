@@ -27,7 +27,7 @@ COMPOSED = 0.6  # share of the crops that are composed; the others are cut out o
 REAL = 0.5  # share of the composed crops that show scanned objects, not groceries made by code
 ANEW = 250  # steps after which the banks are encoded anew
 OTHERS = 8  # a crop is held against each eighth view of the objects that are not in the batch
-AT_A_TIME = 200  # views that are encoded together
+AT_A_TIME = 500  # views that are encoded together
 SEEN = 0.25  # a crop counts if so much of its object is seen
 EVALUATED = 600  # crops in an evaluation
 
@@ -78,9 +78,9 @@ class EncoderTask:
             crops = material.held_out.draw(part, rng)
             similar = self.encoder(crops.seen) @ vectors.T
             named.append(owner[similar.argmax(1)] == crops.object)
-            mine = torch.where(owner == crops.object[:, None], similar, torch.tensor(-9.0))
+            mine = torch.where(owner == crops.object[:, None], similar, -9.0)
             turned.append((directions[mine.argmax(1)] * crops.direction).sum(1).clamp(-1, 1).arccos())
-        right, angle = torch.cat(named).float(), torch.cat(turned)
+        right, angle = torch.cat(named).float().cpu(), torch.cat(turned)
         new = torch.tensor(np.isin(material.held_out.sights.object[chosen], material.held_numbers))
         fresh = {"named_new": float(right[new].mean())} if new.any() else {}
         return {"named": float(right[~new].mean()), **fresh, "turn_rad": float(angle.median()),
@@ -114,7 +114,7 @@ def contrast(seen: Tensor, known: Tensor, crops: Crops, sharpness: Tensor) -> tu
     """The cross entropy between similarities of vectors and what they should be, from crops to views and back."""
     angle = (crops.direction @ crops.direction.T).clamp(-1 + 1e-6, 1 - 1e-6).arccos()
     same = crops.object[:, None] == crops.object[None]
-    target = torch.where(same, torch.exp(-(angle / NEAR_RAD) ** 2), torch.zeros(()))
+    target = torch.where(same, torch.exp(-(angle / NEAR_RAD) ** 2), 0.0)
     target.fill_diagonal_(1.0)
     logits = sharpness * (seen @ known.T)
     weight = (crops.visible > SEEN).float()
@@ -126,20 +126,25 @@ def contrast(seen: Tensor, known: Tensor, crops: Crops, sharpness: Tensor) -> tu
 
 
 class Banks:
-    """The encoded views of objects: vectors [V, D], the objects' numbers [V] and directions [V, 3]."""
+    """The encoded views of objects: vectors [V, D], the objects' numbers [V], the views' numbers there [V], and
+    directions [V, 3]."""
 
     @torch.no_grad()
     def __init__(self, encoder: ViewEncoder, material: Material, numbers: Iterable[int]):
         maker = material.composed
-        pairs = [(number, view) for number in numbers for view in range(len(material.tiles[number].directions))]
-        which, index = (np.array(column) for column in zip(*pairs, strict=True))
-        vectors = []
+        numbers, vectors = np.array(numbers), []
+        which = np.repeat(numbers, maker.views[numbers])
+        index = np.concatenate([np.arange(count) for count in maker.views[numbers]])
         for part in np.array_split(np.arange(len(which)), -(-len(which) // AT_A_TIME)):
             with torch.autocast(maker.device.type, dtype=torch.bfloat16):
                 vectors.append(encoder(maker.known(which[part], index[part])))
+        self.maker, self.index = maker, index
         self.vectors, self.owner = torch.cat(vectors), torch.as_tensor(which, device=maker.device)
-        directions = np.concatenate([material.tiles[number].directions for number in numbers])
-        self.directions = torch.tensor(directions, dtype=torch.float32, device=maker.device)
+        self.directions = maker.directions[maker.view(which, index)]
+
+    def views(self, chosen: Tensor) -> Tensor:
+        """The known views [B, 4, 64, 64] with the numbers `chosen` [B]."""
+        return self.maker.known(self.owner[chosen].cpu().numpy(), self.index[chosen.cpu().numpy()])
 
     def against(self, seen: Tensor, crops: Crops, sharpness: Tensor) -> tuple[Tensor, float]:
         """The cross entropy of vectors [B, D] of crops against the views of their objects and some of all others, and

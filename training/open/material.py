@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import zipfile
+from collections import Counter
 from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
@@ -16,7 +19,7 @@ from saccade.shared.errors import SaccadeError
 from saccade.shared.files import writing
 from saccade.shared.render.groceries import grocery
 from saccade.shared.render.mesh import Mesh, read_obj
-from saccade.shared.render.objects import load_mesh
+from saccade.shared.render.objects import load_mesh, names_of
 from saccade.training.open.composer import CropMaker
 from saccade.training.open.table_crops import Sights, TableCrops, sights_of
 from saccade.training.open.tables import Tables, render_tables
@@ -28,7 +31,9 @@ MADE_VIEWS, MADE_VARIANTS = 60, 2  # of a grocery made by code
 SHARD = 200  # tables in a file
 SCANNED, MADE_BESIDE = 14, 26  # objects of a shard
 HELD = "held_out"  # name of the shard to evaluate on
+BUILT_IN = "pantry"  # set of objects that everybody has
 Show = Callable[[str, int, int], None]
+Job = tuple[str, str, tuple[str, ...]]  # what is rendered, the file's name, and the objects
 
 
 @dataclass(frozen=True)
@@ -52,12 +57,13 @@ class Material:
 
 
 class Objects:
-    """The objects of a run: scanned ones, and groceries made by code. Raises SaccadeError if two have one name, or if
-    one that is held out is not there."""
+    """The objects of a run: scanned ones, the pantry's, and groceries made by code. Raises SaccadeError if two have one
+    name, or if one that is held out is not there."""
 
     def __init__(self, config: TrainingConfig):
         self.seed = config.seed
-        self._paths: dict[str, Path | str] = dict.fromkeys(config.names, config.objects)
+        self._paths: dict[str, Path | str] = {name: BUILT_IN for name in names_of(BUILT_IN)}
+        self._paths |= dict.fromkeys(config.names, config.objects)
         for folder in config.scans:
             for path in _folders(Path(folder)):
                 if self._paths.setdefault(path.name, path) != path:
@@ -85,24 +91,44 @@ class Objects:
                               *map(str, rng.permutation(self.made)[:MADE_BESIDE]))
 
 
-def prepare(run_dir: Path, config: TrainingConfig, show: Show) -> None:
-    """Renders what the run's folder lacks. `show` is told (what, how many are done, how many there are)."""
+def prepare(run_dir: Path, config: TrainingConfig, show: Show, jobs: int = 1) -> None:
+    """Renders what the run's folder lacks, in `jobs` processes. `show` is told (what, how many are done, how many there
+    are)."""
     objects, folder = Objects(config), run_dir / "views"
-    scanned = "views of scans", objects.scanned, config.views, VARIANTS
-    made = "views of groceries", objects.made, min(MADE_VIEWS, config.views), MADE_VARIANTS
-    for what, names, count, variants in (scanned, made):
-        absent = [name for name in names if not (folder / f"{name}.npy").is_file()]
-        for done, name in enumerate(absent):
-            render_tiles(folder, [objects.mesh(name)], count=count, variants=variants, seed=config.seed)
-            show(what, done + 1, len(absent))
-    shards = list(objects.shards(config.tables))
-    for done, (shard, names) in enumerate(shards):
-        path = run_dir / "tables" / f"{shard}.npz"
-        if not path.is_file():
-            meshes = tuple(objects.mesh(name) for name in names)
-            seed = config.seed, 13, *shard.encode()
-            _save(path, meshes, render_tables(meshes, min(SHARD, config.tables), np.random.default_rng(seed)))
-        show("tables", done + 1, len(shards))
+    kinds = {"views of scans": objects.scanned, "views of groceries": objects.made}
+    work: list[Job] = [(what, name, (name,)) for what, names in kinds.items() for name in names
+                       if not (folder / f"{name}.npy").is_file()]
+    work += [("tables", shard, names) for shard, names in objects.shards(config.tables)
+             if not _shard(run_dir, shard).is_file()]
+    total, done = Counter(what for what, _, _ in work), Counter[str]()
+    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
+        try:
+            for rendering in as_completed([pool.submit(_render, run_dir, config, job) for job in work]):
+                done[what := rendering.result()] += 1
+                show(what, done[what], total[what])
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+
+
+def _render(run_dir: Path, config: TrainingConfig, job: Job) -> str:
+    """Renders one file. Returns what it is."""
+    what, name, names = job
+    objects = Objects(config)
+    meshes = tuple(objects.mesh(each) for each in names)
+    if what == "tables":
+        seed = config.seed, 13, *name.encode()
+        _save(_shard(run_dir, name), meshes, render_tables(meshes, min(SHARD, config.tables),
+                                                           np.random.default_rng(seed)))
+    else:
+        made = name in objects.made
+        render_tiles(run_dir / "views", meshes, count=min(MADE_VIEWS, config.views) if made else config.views,
+                     variants=MADE_VARIANTS if made else VARIANTS, seed=config.seed)
+    return what
+
+
+def _shard(run_dir: Path, name: str) -> Path:
+    return run_dir / "tables" / f"{name}.npz"
 
 
 def _save(path: Path, meshes: tuple[Mesh, ...], tables: Tables) -> None:
@@ -122,7 +148,7 @@ def load_material(run_dir: Path, config: TrainingConfig, device: torch.device) -
     numbers = {name: n for n, name in enumerate(names)}
     tiles = list(load_tiles(run_dir / "views", names))
     maker = CropMaker(tiles, device, config.seed)
-    paths = [run_dir / "tables" / f"{shard}.npz" for shard, _ in objects.shards(config.tables)]
+    paths = [_shard(run_dir, shard) for shard, _ in objects.shards(config.tables)]
     held, tables = (_table_crops(some, numbers, maker) for some in (paths[:1], paths[1:]))
     real = np.arange(len(objects.scanned))
     return Material(tiles, real, np.arange(len(real), len(names)), np.array([numbers[n] for n in config.held_out], int),

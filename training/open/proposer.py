@@ -16,7 +16,7 @@ from torch import Tensor
 from saccade.services.perception.proposer import STRIDE, Proposer, places, propose, radius_px
 from saccade.shared.world.geometry import project
 from saccade.training.open.table_crops import INTRINSICS, TableCrops
-from saccade.training.open.tables import FRAME_PX
+from saccade.training.open.tables import FRAME_PX, MOST
 from saccade.training.settings import TrainingConfig
 from saccade.training.tasks import on_device
 
@@ -45,7 +45,7 @@ class ProposerTask:
         torch.manual_seed(config.seed)
         self.config, self.tables, self.held_out, self.device = config, tables, held_out, device
         self.proposer = on_device(Proposer(), device)
-        self.circles, self.held_circles = circles_px(tables), circles_px(held_out)
+        self.circles, self.held_circles = by_label(tables, device), circles_px(held_out)
         self.lambdas: list[float] = []
 
     @property
@@ -79,9 +79,9 @@ class ProposerTask:
         shift, ratio = [], []
         count = min(EVALUATED, len(self.held_out.rgb))
         for n in range(count):
-            image = torch.from_numpy(self.held_out.rgb[n]).permute(2, 0, 1)[None].float() / 255.0
+            image = self.held_out.rgb[n].permute(2, 0, 1)[None].float() / 255.0
             foreground, votes = self.proposer(image)
-            proposals = propose(foreground[0], votes[0])
+            proposals = propose(foreground[0].cpu(), votes[0].cpu())
             here = self.held_out.sights.table == n
             circles = torch.tensor(self.held_circles[here], dtype=torch.float32)
             visible = torch.tensor(self.held_out.sights.visible[here])
@@ -120,17 +120,27 @@ def circles_px(crops: TableCrops) -> NDArray[np.float64]:
     return np.concatenate([center, radius_px(crops.sights.half_tangent, ahead, INTRINSICS[0])[:, None]], axis=1)
 
 
-def images(crops: TableCrops, circles: NDArray[np.float64], chosen: NDArray[np.int64], rng: np.random.Generator,
+def by_label(crops: TableCrops, device: torch.device) -> Tensor:
+    """The circles [F, L, 3] of tables' things by their labels in `instance`, see `circles_px`; NaN where too little of
+    a thing is seen."""
+    sights = crops.sights
+    circles = torch.full((len(crops.rgb), MOST + 1, 3), torch.nan)
+    circles[sights.table, sights.slot + 1] = torch.tensor(circles_px(crops), dtype=torch.float32)
+    return circles.to(device)
+
+
+def images(crops: TableCrops, circles: Tensor, chosen: NDArray[np.int64], rng: np.random.Generator,
            device: torch.device) -> tuple[Tensor, Targets]:
-    """Images [B, 3, 256, 256] of the tables `chosen` [B], changed at random, and their targets."""
-    count, cells = len(chosen), INPUT_PX // STRIDE
+    """Images [B, 3, 256, 256] of the tables `chosen` [B], changed at random, and their targets. `circles` are those of
+    all tables, see `by_label`."""
+    count = len(chosen)
     generator = torch.Generator(device).manual_seed(int(rng.integers(2 ** 62)))
 
     def uniform(*shape: int) -> Tensor:
         return torch.rand(*shape, generator=generator, device=device)
 
-    rgb = torch.from_numpy(crops.rgb[chosen]).to(device).permute(0, 3, 1, 2).float() / 255.0
-    instance = torch.from_numpy(crops.instance[chosen]).to(device)[:, None].float()
+    table = torch.as_tensor(chosen, device=device)
+    rgb, instance = crops.rgb[table].permute(0, 3, 1, 2).float() / 255.0, crops.instance[table][:, None].float()
     # The frame's place of each pixel: turned, mirrored, enlarged and shifted.
     zoom = ZOOM[0] * (ZOOM[1] / ZOOM[0]) ** uniform(count)
     angle = (uniform(count) * 2 - 1) * torch.where(uniform(count) < 0.3, torch.pi, 0.3)
@@ -148,30 +158,20 @@ def images(crops: TableCrops, circles: NDArray[np.float64], chosen: NDArray[np.i
                         crops.maker.camera(image, uniform, gently=True), image)
     label = labels[:, 0, STRIDE // 2::STRIDE, STRIDE // 2::STRIDE].long()
     label = torch.where(outside[:, STRIDE // 2::STRIDE, STRIDE // 2::STRIDE], -1, label)
-    return image, _targets(crops, circles, chosen, label, rows, zoom, cells)
+    return image, _targets(circles[table], label, rows, zoom)
 
 
-def _targets(crops: TableCrops, circles: NDArray[np.float64], chosen: NDArray[np.int64], label: Tensor, rows: Tensor,
-             zoom: Tensor, cells: int) -> Targets:
-    """The targets of cells with these labels [B, h, w] (-1: outside of the frame). `rows` [B, 2, 3] are the affine maps
-    from the images to the frames."""
-    foreground = torch.where(label < 0, torch.nan, (label > 0).float())
-    votes = torch.zeros(len(chosen), 3, cells, cells)
-    place = places(INPUT_PX, INPUT_PX)
-    for b, table in enumerate(chosen):
-        here = np.flatnonzero(crops.sights.table == table)
-        known = {int(crops.sights.slot[n]) + 1: circles[n] for n in here}
-        back = torch.linalg.inv(rows[b, :, :2])
-        for number in label[b].unique().tolist():
-            if number < 1:
-                continue
-            shown = label[b] == number
-            if number not in known:  # too little of it is seen
-                foreground[b][shown] = torch.nan
-                continue
-            center = torch.tensor(known[number][:2] / FRAME_PX * 2 - 1, dtype=torch.float32)
-            mapped = (back @ (center - rows[b, :, 2]) + 1) / 2 * INPUT_PX
-            votes[b, :2][:, shown] = (mapped[:, None, None] - place)[:, shown]
-            votes[b, 2][shown] = float(np.log(known[number][2])) + float(zoom[b].log()) \
-                + float(np.log(INPUT_PX / FRAME_PX))
-    return Targets(foreground, votes)
+def _targets(circles: Tensor, label: Tensor, rows: Tensor, zoom: Tensor) -> Targets:
+    """The targets of cells with these labels [B, h, w] (-1: outside of the frame), where the tables' things have the
+    circles [B, L, 3]. `rows` [B, 2, 3] are the affine maps from the images to the frames."""
+    center = circles[..., :2] / FRAME_PX * 2 - 1
+    back = torch.linalg.inv(rows[:, :, :2])
+    mapped = ((center - rows[:, None, :, 2]) @ back.transpose(1, 2) + 1) / 2 * INPUT_PX
+    size = circles[..., 2].log() + zoom.log()[:, None] + float(np.log(INPUT_PX / FRAME_PX))
+    things = torch.cat([mapped, size[..., None]], -1)
+    own = things[torch.arange(len(label), device=label.device)[:, None, None], label.clamp(min=0)].permute(0, 3, 1, 2)
+    unknown = (label < 0) | ((label > 0) & own[:, 2].isnan())
+    foreground = torch.where(unknown, torch.nan, (label > 0).float())
+    place = places(INPUT_PX, INPUT_PX).to(label.device)
+    votes = torch.cat([own[:, :2] - place, own[:, 2:]], 1)
+    return Targets(foreground, votes.nan_to_num(0.0))

@@ -87,7 +87,8 @@ class TableCrops:
     [F, 256, 256], see `Tables`. `maker` has the views that banks have."""
 
     def __init__(self, rgb: NDArray[np.uint8], instance: NDArray[np.uint8], sights: Sights, maker: CropMaker):
-        self.rgb, self.instance, self.sights, self.maker = rgb, instance, sights, maker
+        self.rgb, self.instance = (torch.from_numpy(each).to(maker.device) for each in (rgb, instance))
+        self.sights, self.maker = sights, maker
         axis = (np.arange(FINE_PX) + 0.5) / FINE_PX * 2 - 1
         x, y = np.meshgrid(axis, axis)
         self.plane = torch.tensor(np.stack([x, -y], -1), dtype=torch.float32, device=maker.device)
@@ -106,23 +107,23 @@ class TableCrops:
         shift, roll = (uniform(count, 2) * 2 - 1) * 2 * SHIFT, (uniform(count) * 2 - 1) * ROLL_RAD
         pixels = self._pixels(chosen, shift, scale, roll)
         grid = pixels / FRAME_PX * 2 - 1
-        rgb = torch.from_numpy(self.rgb[sights.table[chosen]]).to(device).permute(0, 3, 1, 2).float() / 255.0
-        mine = self.instance[sights.table[chosen]] == (sights.slot[chosen] + 1)[:, None, None]
-        others = (self.instance[sights.table[chosen]] > 0) & ~mine
-        layers = torch.from_numpy(np.stack([mine, others], 1).astype(np.float32)).to(device)
+        table, slot = (torch.as_tensor(each[chosen], device=device) for each in (sights.table, sights.slot))
+        instance = self.instance[table]
+        mine = instance == (slot + 1)[:, None, None]
+        layers = torch.stack([mine, (instance > 0) & ~mine], 1).float()
+        rgb = self.rgb[table].permute(0, 3, 1, 2).float() / 255.0
         cut = F.grid_sample(torch.cat([rgb, layers], 1), grid, align_corners=False)
         cut = F.avg_pool2d(cut, 2)
         image, alpha, beside = cut[:, :3], cut[:, 3:4], cut[:, 4:5]
         mask = self.maker.found(alpha, beside, uniform)
         image = self.maker.camera(image, uniform, gently=True)
         which = sights.object[chosen]
+        direction = torch.tensor(sights.direction[chosen], dtype=torch.float32, device=device)
         if index is None:
-            index = np.array([np.argmax(self.maker.tiles[o].directions @ d)
-                              for o, d in zip(which, sights.direction[chosen], strict=True)])
+            index = self.maker.angles(which, direction).argmin(1).cpu().numpy()
         off = torch.cat([shift, scale.log()[:, None], roll[:, None]], dim=1)
         return Crops(torch.cat([image, mask], 1), self.maker.known(which, index), torch.as_tensor(which, device=device),
-                     torch.tensor(sights.direction[chosen], dtype=torch.float32, device=device),
-                     torch.tensor(sights.visible[chosen], dtype=torch.float32, device=device), off)
+                     direction, torch.tensor(sights.visible[chosen], dtype=torch.float32, device=device), off)
 
     def _pixels(self, chosen: NDArray[np.int64], shift: Tensor, scale: Tensor, roll: Tensor) -> Tensor:
         """Where crops lie in the frames [B, 128, 128, 2] so that each circle has its centre at `shift`, is `scale`

@@ -68,7 +68,8 @@ def render_tiles(folder: Path, meshes: Sequence[Mesh], *, count: int, variants: 
             images = _render(world, mesh, count, variants, np.random.default_rng([seed, *mesh.name.encode()]))
             path = _path(folder, mesh.name)
             with writing(path, "views"):
-                temporary = path.with_suffix(".tmp.npy")
+                np.save(_circles_path(folder, mesh.name), circles_of(images[:, 0, ..., 3]))
+                temporary = path.with_suffix(".tmp.npy")  # last and at once, because it says that both are there
                 np.save(temporary, images)
                 os.replace(temporary, path)
             progress(mesh.name)
@@ -130,13 +131,19 @@ def load_tiles(folder: Path, names: Sequence[str]) -> Iterator[Tiles]:
         path = _path(folder, name)
         try:
             images = np.load(path, mmap_mode="r", allow_pickle=False)
-            if images.ndim != 5 or images.shape[2:] != (TILE_PX, TILE_PX, 4) or images.dtype != np.uint8:
-                raise ValueError(f"shape {images.shape}")
+            circles = np.load(_circles_path(folder, name), allow_pickle=False)
+            if images.ndim != 5 or images.shape[2:] != (TILE_PX, TILE_PX, 4) or images.dtype != np.uint8 \
+                    or circles.shape != (len(images), 3):
+                raise ValueError(f"shapes {images.shape} and {circles.shape}")
         except (OSError, ValueError) as error:
             raise SaccadeError(f"views {path} are missing or damaged ({error}): remove the file, they are rendered "
                                "again") from error
-        yield Tiles(name, images, fibonacci_sphere(len(images)), circles_of(images[:, 0, ..., 3]))
+        yield Tiles(name, images, fibonacci_sphere(len(images)), circles)
 
 
 def _path(folder: Path, name: str) -> Path:
     return folder / f"{name}.npy"
+
+
+def _circles_path(folder: Path, name: str) -> Path:
+    return folder / f"{name}.circles.npy"
