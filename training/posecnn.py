@@ -118,7 +118,7 @@ class PoseCnnTask:
         for name, values in errors.items():
             measured[name] = float(values.median())
             for k, of in enumerate(self.config.names):
-                mine = values[which == k]
+                mine = values[(which == k).to(values.device)]
                 measured[f"{of}.{name}"] = float(mine.median()) if len(mine) else 0.0
         return measured
 

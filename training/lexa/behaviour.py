@@ -85,7 +85,7 @@ def explorer_loss(learner: Learner, start: State, generator: torch.Generator) ->
     imagined = imagine(learner, start, lambda feature: squashed(learner.explorer, feature, generator), generator)
     inputs = torch.cat([imagined.features[:-1], imagined.actions], dim=-1)
     guesses = torch.stack([Frozen(member)(inputs).float() for member in learner.ensemble])
-    rewards = guesses.std(0).mean(-1)
+    rewards = (guesses - guesses.mean(0)).square().mean(0).clamp(min=1e-12).sqrt().mean(-1)
     policy, critic = policy_loss(imagined, rewards, learner.worth_explored, imagined.features)
     return policy + critic, {"disagreement": rewards.mean()}
 

@@ -21,7 +21,7 @@ from saccade.training.lexa.world_model import (
 )
 from saccade.training.pictures import draw_rows
 from saccade.training.settings import TrainingConfig
-from saccade.training.tasks import generator_of
+from saccade.training.tasks import generator_of, on_device
 
 EPISODE, SEQUENCE = 50, 25  # steps of an episode; images of a piece that is learnt from
 FIRST = 8  # episodes before the first step of learning
@@ -34,7 +34,7 @@ class LexaTask:
     def __init__(self, config: TrainingConfig, part: str, device: torch.device, folder: Path, step: int):
         torch.manual_seed(config.seed)
         self.config, self.part, self.device, self.folder = config, part, device, folder
-        self.module = Learner().to(device)
+        self.module = on_device(Learner(), device)
         self.room = Room(config.objects, config.names, folder, EPISODE)
         self.replay = Replay(folder / "episodes", self._episodes_at(step))
         self.lambdas: list[float] = []
@@ -53,11 +53,11 @@ class LexaTask:
         states, posterior, prior = observe(learner.actor.model, encodings, batch.actions, generator)
         with torch.autocast(self.device.type, dtype=torch.bfloat16):
             model, parts = model_loss(learner, batch, encodings, states, posterior, prior)
-        spread = ensemble_loss(learner, states, batch.actions, encodings)
-        distance = distance_loss(learner, encodings, generator)
-        start, goals = self._starts(states, encodings, generator)
-        exploring, told = explorer_loss(learner, start, generator)
-        achieving, told_too = achiever_loss(learner, start, goals, generator)
+            spread = ensemble_loss(learner, states, batch.actions, encodings)
+            distance = distance_loss(learner, encodings, generator)
+            start, goals = self._starts(states, encodings, generator)
+            exploring, told = explorer_loss(learner, start, generator)
+            achieving, told_too = achiever_loss(learner, start, goals, generator)
         loss = model + spread + distance + exploring + achieving
         parts = {**parts, "time": distance, **told, **told_too}
         return loss, {name: float(value.detach()) for name, value in parts.items()}
