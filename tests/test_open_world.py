@@ -8,7 +8,7 @@ import torch
 
 from saccade.services.perception.bank import FILLED, Bank, bank_of, compressed
 from saccade.services.perception.comparer import Compared, Comparison
-from saccade.services.perception.open_world import Match, OpenWorld, Placed
+from saccade.services.perception.open_world import Match, OpenWorld, Placed, Things, rolled
 from saccade.services.perception.proposer import STRIDE, Proposer, places, propose
 from saccade.services.perception.view_encoder import VECTOR, ViewEncoder
 from saccade.shared.render.groceries import grocery
@@ -62,17 +62,26 @@ def window_of(mesh, camera_from_object, up, shift=(0.0, 0.0), log_ratio=0.0):
     return Window(pixel, np.ones(1), np.array([2 * REFERENCE_RANGE_M * half]))
 
 
+def things_of(window, roll=0.0):
+    """One thing, whose crop was rolled by an angle."""
+    return Things(torch.zeros(1, 4, 64, 64), window, torch.zeros(1, 4, 4), np.array([roll]))
+
+
 @pytest.mark.parametrize("off", [((0.0, 0.0), 0.0), ((0.15, -0.1), 0.1), ((-0.2, 0.05), -0.15)])
 @pytest.mark.parametrize("aside", [(0.0, 0.0), (0.12, -0.08)])
-def test_from_right_outputs_follow_pixel_range_and_rotation(mesh, bank, off, aside):
+@pytest.mark.parametrize("roll", [0.0, np.pi / 2, -np.pi / 4])
+def test_from_right_outputs_follow_pixel_range_and_rotation(mesh, bank, off, aside, roll):
     world_from_object = pose(rotation_xyz((0.0, 0.0, 0.7)), (0.1, 0.05, 0.06))
     eye = world_from_object[:3, 3] + 0.6 * direction(0.4, 0.5)
     camera = look_at(eye, world_from_object[:3, 3] + (*aside, 0.0))
     camera_from_object = np.linalg.inv(camera) @ world_from_object
     up = camera[2, :3]
-    view, compared = outputs(bank, camera_from_object, *off)
-    placed = Placed(bank, Match(0, 0.9, view, 0), compared, window_of(mesh, camera_from_object, up, *off),
-                    INTRINSICS_PX, up)
+    # In a crop that is rolled, the comparer sees the shift turned, and the view rolled.
+    cos, sin = np.cos(roll), np.sin(roll)
+    turned = (cos * off[0][0] - sin * off[0][1], sin * off[0][0] + cos * off[0][1])
+    view, compared = outputs(bank, camera_from_object, turned, off[1], roll)
+    things = things_of(window_of(mesh, camera_from_object, up, *off), roll)
+    placed = Placed(bank, Match(0, 0.9, view, 0), compared, things, INTRINSICS_PX, up)
     pixel, _ = project(world_from_object[:3, 3], camera, INTRINSICS_PX)
     assert placed.pixel == pytest.approx(pixel, abs=6.0)
     assert placed.range_m == pytest.approx(np.linalg.norm(camera_from_object[:3, 3]), rel=0.06)
@@ -82,12 +91,20 @@ def test_from_right_outputs_follow_pixel_range_and_rotation(mesh, bank, off, asi
     assert modes.log_probability.argmax() == 0
 
 
+def test_a_crop_is_rolled_by_the_angle_that_is_told():
+    crop = torch.zeros(1, 1, 64, 64)
+    crop[0, 0, 28:36, 48:56] = 1.0  # to the right of the middle
+    turned = rolled(crop, torch.tensor([np.pi / 2], dtype=torch.float32))
+    v, u = (float(x.double().mean()) for x in torch.nonzero(turned[0, 0] > 0.5, as_tuple=True))
+    assert (u, v) == pytest.approx((31.5, 51.5), abs=0.6)  # below it
+
+
 def test_two_views_that_cannot_be_told_apart_are_two_modes(bank):
     one, other = 0, int(np.argmin(bank.directions @ bank.directions[0]))
     raw = torch.zeros(2, 11)
     raw[:, 0], raw[:, 7:] = 2.0, -3.0
     window = Window(np.array([[240.0, 240.0]]), np.ones(1), np.array([0.15]))
-    placed = Placed(bank, Match(0, 0.9, one, 0), Compared(raw), window, INTRINSICS_PX, UP)
+    placed = Placed(bank, Match(0, 0.9, one, 0), Compared(raw), things_of(window), INTRINSICS_PX, UP)
     towards = torch.tensor(bank.directions @ bank.directions[[one, other]].T, dtype=torch.float32).max(1).values
     modes = placed.modes(towards, [(one, 0), (other, 1)], 30.0)
     assert np.exp(modes.log_probability[:2]) == pytest.approx(0.5, abs=0.12)
@@ -137,9 +154,7 @@ def test_a_thing_is_one_object_or_none(bank):
     """The probabilities of all objects in one thing sum to less than 1."""
     torch.manual_seed(2)
     model = OpenWorld(Proposer(), ViewEncoder(), Comparison(), [bank, bank, bank])
-    raw = torch.zeros(3, 11)
-    raw[:, 0] = torch.tensor([3.0, 2.0, -4.0])
-    matches = model._matches([(k, 0, 0) for k in range(3)], Compared(raw))
+    matches = model._matches([(k, 0, 0) for k in range(3)], np.array([3.0, 2.0, -4.0]))
     presence = [match.presence for match in matches]
     assert sum(presence) < 1.0
     assert presence[0] == pytest.approx(np.exp(3) / (1 + np.exp(3) + np.exp(2) + np.exp(-4)))

@@ -43,7 +43,9 @@ class Bank:
     def image(self, view: int) -> NDArray[np.uint8]:
         """A view [64, 64, 4] uint8: RGB, premultiplied by the coverage, and the coverage."""
         with Image.open(io.BytesIO(self.pictures[view])) as picture:
-            return np.asarray(picture.convert("RGBA"))
+            image = np.asarray(picture.convert("RGBA"))
+        # The compression leaves colours where nothing is covered.
+        return np.concatenate([np.minimum(image[..., :3], image[..., 3:]), image[..., 3:]], axis=2)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """What is kept in a file."""

@@ -19,7 +19,7 @@ from saccade.services.perception.networks import block, normed
 STRIDE = 4  # pixels of the image per cell of the maps
 OBLIQUE = 1.5  # exponent of the cosine: the mean of 2 along a radius of the image, and 1 across
 REACH = 64.0  # pixels: unit of the votes for the centre
-MOST = 12  # proposals in an image
+MOST = 24  # proposals in an image
 FOREGROUND = 0.5  # cells that are likelier than this to show a thing count when proposals are found
 NEAR = 0.35  # votes within this share of a thing's radius of its centre are for it
 SUPPORT = 0.08  # least share of the square around a thing's circle that its voters cover

@@ -209,7 +209,8 @@ class CropMaker:
         return F.avg_pool2d(mask, 3, 1, 1)
 
     def camera(self, image: Tensor, uniform, gently: bool = False) -> Tensor:
-        """Exposure, colours, gamma, few pixels, blur and noise. `gently` leaves some of the images as they are."""
+        """Exposure, colours, gamma, uneven light, glare, few pixels, blur and noise. `gently` leaves some of the images
+        as they are."""
         count, before = len(image), image
 
         def each(low: float, high: float) -> Tensor:
@@ -217,10 +218,30 @@ class CropMaker:
 
         image = image.clamp(1e-4, 1) ** each(0.75, 1.35) * each(0.55, 1.3)
         image = image * (0.82 + 0.36 * uniform(count, 3, 1, 1))
+        image = _uneven(image, uniform)
+        grey = image.mean(1, keepdim=True)
+        image = grey + (image - grey) * each(0.45, 1.35)
+        image = image + (uniform(count, 1, 1, 1) * 0.4 + 0.6 - image) * each(-0.1, 0.2)  # haze, or hard contrast
         coarse = F.interpolate(F.interpolate(image, size=(20, 20), mode="area"), size=image.shape[-2:], mode="bilinear")
         half = F.interpolate(F.interpolate(image, size=(36, 36), mode="area"), size=image.shape[-2:], mode="bilinear")
         pick = uniform(count)[:, None, None, None]
         image = torch.where(pick < SMALL / 3, coarse, torch.where(pick < SMALL, half, image))
+        image = image + (image - F.avg_pool2d(image, 3, 1, 1)) * (each(-0.5, 1.5)).clamp(min=0.0)  # sharpened
         noise = (uniform(*image.shape) - 0.5) * 12 ** 0.5
         image = (image + noise * each(0, 0.04)).clamp(0, 1)
         return torch.where((uniform(count) < AS_IT_IS)[:, None, None, None], before, image) if gently else image
+
+
+def _uneven(image: Tensor, uniform) -> Tensor:
+    """Light that falls off across images [B, 3, H, W], and a soft highlight on some."""
+    count, (height, width) = len(image), image.shape[-2:]
+    x = torch.linspace(-1, 1, width, device=image.device)[None, None, None]
+    y = torch.linspace(-1, 1, height, device=image.device)[None, None, :, None]
+
+    def each(low: float, high: float) -> Tensor:
+        return (low + (high - low) * uniform(count))[:, None, None, None]
+
+    angle = each(0, 2 * np.pi)
+    image = image * (1 + each(0, 0.45) * (x * angle.cos() + y * angle.sin()))
+    spot = torch.exp(-((x - each(-0.8, 0.8)) ** 2 + (y - each(-0.8, 0.8)) ** 2) / each(0.1, 0.5) ** 2)
+    return image + spot * each(-0.6, 0.5).clamp(min=0.0)
