@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from saccade.services.perception.open_world import turned
+from saccade.services.perception.open_world import LogOdds, turned
 from saccade.services.perception.view_encoder import ViewEncoder
 from saccade.shared.errors import SaccadeError
 from saccade.shared.render.groceries import grocery
@@ -12,6 +12,7 @@ from saccade.shared.world.geometry import INTRINSICS_PX, fibonacci_sphere, proje
 from saccade.training.crops import warp
 from saccade.training.open.comparer import turn_between
 from saccade.training.open.composer import CropMaker
+from saccade.training.open.presence import fitted
 from saccade.training.open.table_crops import TableCrops, sights_of
 from saccade.training.open.tables import FRAME_PX, render_tables
 from saccade.training.open.tiles import load_tiles, render_tiles
@@ -146,3 +147,13 @@ def test_a_turn_and_its_measure_belong_together(turn):
 def test_the_encoder_gives_unit_vectors():
     vectors = ViewEncoder()(torch.rand(3, 4, 64, 64))
     assert vectors.norm(dim=1).detach().numpy() == pytest.approx(1.0, abs=1e-5)
+
+
+def test_what_makes_an_object_likely_is_found_again():
+    """Labels drawn by known log odds give these back, but for what chance does."""
+    generator = torch.Generator().manual_seed(0)
+    alike = torch.rand(6000, 5, generator=generator) * 0.5 + 0.4
+    same = torch.randn(6000, 5, generator=generator)
+    odds = torch.cat([LogOdds(30.0, 1.0, 24.0)(alike, same), torch.zeros(6000, 1)], 1)
+    found = fitted(alike, same, torch.multinomial(odds.softmax(1), 1, generator=generator)[:, 0])
+    assert (found.similar, found.compared, found.none) == pytest.approx((30.0, 1.0, 24.0), rel=0.08)

@@ -8,6 +8,7 @@ import platform
 import subprocess
 import sys
 import time
+from dataclasses import asdict
 from pathlib import Path
 
 import torch
@@ -24,7 +25,7 @@ from saccade.shared.render.views import crop_side_m
 from saccade.training.checkpoints import ccn_of, finished
 from saccade.training.dataset import render_missing
 from saccade.training.open.material import prepare
-from saccade.training.open.tasks import banks_for
+from saccade.training.open.tasks import banks_for, log_odds_for
 from saccade.training.part import pick_device
 from saccade.training.settings import EXTRACTION, WHOLE, TrainingConfig, load_settings
 
@@ -159,8 +160,10 @@ def _export_open(run_dir: Path, config: TrainingConfig, weights_dir: Path) -> No
         trained = {part: finished(run_dir, config, part) for part in config.parts}
         losses = {part: json.loads((run_dir / part / "losses.jsonl").read_text().splitlines()[-1])
                   for part in config.parts}
-        write_weights(networks, {part: state for part, (_, state) in trained.items()}, (), {
-            "architecture": config.architecture, "data": "views and rendered tables of scanned objects, and of "
+        states = {part: state for part, (_, state) in trained.items()}
+        write_weights(networks, states, (), {
+            "architecture": config.architecture, "calibration": asdict(log_odds_for(run_dir, config, states)),
+            "data": "views and rendered tables of scanned objects, the pantry's, and of "
             f"{config.groceries} groceries made by code", "training": config.model_dump(mode="json"), "losses": losses,
             "commits": {part: facts.get("commit", "unknown") for part, (facts, _) in trained.items()},
             "where_trained": _where(pick_device(config.device)),

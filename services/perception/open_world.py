@@ -35,9 +35,6 @@ CAP_RAD = 0.35  # views within this of a compared one are told as one, where the
 VIEW_STD_RAD = 0.12  # of a direction that is told by a view alone: about half of the way to the next one
 MASK_PX = 60
 SHARPNESS = 20.0  # of the similarities, where it is told how an object is turned
-# The log odds that a thing is an object, against its being none that is known: from the similarity to the object's
-# view, and from the logit of the comparison. Fitted on rendered tables in any light.
-SIMILAR, COMPARED, NONE = 21.5, 0.56, -15.3
 ROLLS_RAD = 2 * np.pi / 8 * np.arange(8)  # in which a thing is tried that is like nothing as it stands
 
 Array = NDArray[np.float64]
@@ -60,7 +57,21 @@ def open_world_of(weights: Weights, names: tuple[str, ...]) -> OpenWorld:
     assert isinstance(proposer, Proposer)  # they are what was filled
     assert isinstance(encoder, ViewEncoder)
     assert isinstance(comparison, Comparison)
-    return OpenWorld(proposer, encoder, comparison, banks)
+    fitted = {key: value for key, value in shared.calibration.items() if key in LogOdds.__annotations__}
+    return OpenWorld(proposer, encoder, comparison, banks, LogOdds(**fitted))
+
+
+@dataclass(frozen=True)
+class LogOdds:
+    """The log odds that a thing is an object, against its being none that is known: `similar` times the similarity to
+    the object's view, and `compared` times the logit of the comparison, less `none`."""
+
+    similar: float = 21.5
+    compared: float = 0.56
+    none: float = 15.3
+
+    def __call__(self, similar: Tensor, same: Tensor | float = 0.0) -> Tensor:
+        return self.similar * similar + self.compared * same - self.none
 
 
 @dataclass(frozen=True)
@@ -90,9 +101,10 @@ class OpenWorld:
 
     square = False  # an image may have any sides
 
-    def __init__(self, proposer: Proposer, encoder: ViewEncoder, comparison: Comparison, banks: list[Bank]):
+    def __init__(self, proposer: Proposer, encoder: ViewEncoder, comparison: Comparison, banks: list[Bank],
+                 log_odds: LogOdds = LogOdds()):
         self.proposer, self.encoder, self.comparison = proposer.eval(), encoder.eval(), comparison.eval()
-        self.banks = banks
+        self.banks, self.log_odds = banks, log_odds
         self.vectors = [torch.from_numpy(bank.vectors) for bank in banks]
         self.sharpness = SHARPNESS
 
@@ -106,13 +118,13 @@ class OpenWorld:
         seen = _nothing(count, rgb.shape)
         if not len(things.crops):
             return seen
-        things, similar = self._rolled(things)
+        things, similar = self.rolled_things(things)
         pairs = [pair for k in range(count) for pair in self._candidates(k, similar[k])]
-        known = torch.stack([self._view(k, view) for k, _, view in pairs])
+        known = torch.stack([self.view(k, view) for k, _, view in pairs])
         compared = Compared(self.comparison(things.crops[[thing for _, thing, _ in pairs]], known))
         masks = F.interpolate(things.masks[:, None], size=(MASK_PX, MASK_PX), mode="bilinear")[:, 0] > 0.5
         alike = torch.stack([similar[k][thing, view] for k, thing, view in pairs])
-        for k, match in enumerate(self._matches(pairs, _log_odds(alike, compared.same).double().numpy())):
+        for k, match in enumerate(self._matches(pairs, self.log_odds(alike, compared.same).double().numpy())):
             seen.presence[k] = match.presence
             placed = Placed(self.banks[k], match, compared, things, intrinsics_px, up)
             seen.pixel[k], seen.scale[k] = placed.pixel, REFERENCE_RANGE_M / placed.range_m
@@ -131,14 +143,14 @@ class OpenWorld:
         vectors = self.encoder(crops)
         return [vectors @ bank.T for bank in self.vectors]
 
-    def _rolled(self, things: Things) -> tuple[Things, list[Tensor]]:
+    def rolled_things(self, things: Things) -> tuple[Things, list[Tensor]]:
         """Things, each rolled so that it is most like something, and their similarities to the views of each object.
 
         What is like something as it stands stays so: most things stand.
         """
         similar = self._similar(things.crops)
         best = torch.stack([each.max(1).values for each in similar], 1).max(1).values
-        lying = torch.nonzero(_log_odds(best, torch.zeros(())) < 0.0)[:, 0]
+        lying = torch.nonzero(self.log_odds(best) < 0.0)[:, 0]
         if not len(lying):
             return things, similar
         crops, roll = things.crops.clone(), things.roll.copy()
@@ -155,7 +167,7 @@ class OpenWorld:
                     mine[thing] = other[row]
         return replace(things, crops=crops, roll=roll), similar
 
-    def _view(self, k: int, view: int) -> Tensor:
+    def view(self, k: int, view: int) -> Tensor:
         """A view of a bank [4, 64, 64] from 0 to 1."""
         return torch.from_numpy(self.banks[k].image(view).copy()).permute(2, 0, 1).float() / 255.0
 
@@ -273,11 +285,6 @@ def rolled(crops: Tensor, angle: Tensor) -> Tensor:
     cos, sin, none = angle.cos(), angle.sin(), torch.zeros_like(angle)
     rows = torch.stack([torch.stack([cos, sin, none], -1), torch.stack([-sin, cos, none], -1)], 1)
     return F.grid_sample(crops, F.affine_grid(rows, list(crops.shape), align_corners=False), align_corners=False)
-
-
-def _log_odds(similar: Tensor, compared: Tensor) -> Tensor:
-    """The log odds that a thing is an object, see SIMILAR."""
-    return SIMILAR * similar + COMPARED * compared + NONE
 
 
 def _turn(angle: float) -> Array:

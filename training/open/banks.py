@@ -10,16 +10,20 @@ from saccade.services.perception.view_encoder import ViewEncoder
 from saccade.shared.render.mesh import Mesh
 from saccade.shared.render.views import crop_side_m
 from saccade.training.open.composer import CropMaker
-from saccade.training.open.tiles import tiles_of
+from saccade.training.open.tiles import Tiles, tiles_of
 
 AT_A_TIME = 50
 
 
-@torch.inference_mode()
 def bank_from(mesh: Mesh, encoder: ViewEncoder, count: int = VIEWS) -> Bank:
     """The bank of a mesh with `count` views. Raises SaccadeError if OpenGL does not work."""
-    tiles = tiles_of(mesh, count)
-    maker = CropMaker([tiles], torch.device("cpu"))
+    return bank_of_tiles(tiles_of(mesh, count), mesh, encoder)
+
+
+@torch.inference_mode()
+def bank_of_tiles(tiles: Tiles, mesh: Mesh, encoder: ViewEncoder) -> Bank:
+    """The bank of a mesh, from its views."""
+    count, maker = len(tiles.images), CropMaker([tiles], torch.device("cpu"))
     parts = np.array_split(np.arange(count), -(-count // AT_A_TIME))
     views = torch.cat([maker.known(np.zeros(len(part), dtype=np.int64), part) for part in parts])
     images = (views.permute(0, 2, 3, 1) * 255).round().byte().numpy()

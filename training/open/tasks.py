@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
+from saccade.services.perception.comparer import Comparison
+from saccade.services.perception.open_world import LogOdds, OpenWorld
+from saccade.services.perception.proposer import Proposer
 from saccade.services.perception.view_encoder import ViewEncoder
 from saccade.shared.model.weights import Weights
 from saccade.shared.render.objects import load_mesh
 from saccade.training.checkpoints import finished
-from saccade.training.open.banks import bank_from
+from saccade.training.open.banks import bank_from, bank_of_tiles
 from saccade.training.open.comparer import ComparerTask
 from saccade.training.open.encoder import EncoderTask
-from saccade.training.open.material import load_material
+from saccade.training.open.material import Objects, load_held_out, load_material
+from saccade.training.open.presence import fit_presence
 from saccade.training.open.proposer import ProposerTask
 from saccade.training.settings import TrainingConfig
 
@@ -31,6 +38,23 @@ def open_task(run_dir: Path, config: TrainingConfig, part: str,
     encoder = ViewEncoder()
     encoder.load_state_dict(finished(run_dir, config, "encoder")[1])
     return ComparerTask(config, material, encoder, device)
+
+
+def log_odds_for(run_dir: Path, config: TrainingConfig, states: Mapping[str, Mapping[str, Tensor]]) -> LogOdds:
+    """How likely a thing is an object by the networks with these tensors, fitted on tables to evaluate on. Raises
+    SaccadeError if these, or a mesh, are missing or damaged."""
+    networks: dict[str, Proposer | ViewEncoder | Comparison] = {
+        "proposer": Proposer(), "encoder": ViewEncoder(), "comparer": Comparison()}
+    for part, network in networks.items():
+        network.load_state_dict(dict(states[part]))
+    proposer, encoder, comparison = networks.values()
+    assert isinstance(proposer, Proposer)  # as they were just made
+    assert isinstance(encoder, ViewEncoder)
+    assert isinstance(comparison, Comparison)
+    tables, objects = load_held_out(run_dir, config), Objects(config)
+    banks = {number: bank_of_tiles(tiles, objects.mesh(tiles.name), encoder)
+             for number, tiles in enumerate(tables.maker.tiles)}
+    return fit_presence(OpenWorld(proposer, encoder, comparison, []), banks, tables, np.random.default_rng(config.seed))
 
 
 def banks_for(config: TrainingConfig, networks: Path) -> dict[str, dict[str, NDArray[Any]]]:
