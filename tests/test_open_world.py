@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from saccade.services.perception.bank import FILLED, Bank, bank_of, compressed
 from saccade.services.perception.comparer import Compared, Comparison
 from saccade.services.perception.open_world import Match, OpenWorld, Placed, Things, rolled
 from saccade.services.perception.proposer import STRIDE, Proposer, places, propose
 from saccade.services.perception.view_encoder import VECTOR, ViewEncoder
+from saccade.shared.model.bank import FILLED, Bank, bank_of, compressed
 from saccade.shared.render.groceries import grocery
 from saccade.shared.world.geometry import (
     INTRINSICS_PX,

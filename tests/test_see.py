@@ -12,7 +12,7 @@ from PIL import Image
 
 from saccade.app.look import see as see_module
 from saccade.app.look.fitting import Fitted
-from saccade.app.look.see import Looker, decoder_of, drawing_of, view_of
+from saccade.app.look.see import Looker, artist_of, degrees, drawing_of, towards_camera
 from saccade.services.perception.seen import Modes, Seen, bits
 from saccade.shared.config import WEIGHTS, Config
 from saccade.shared.model.weights import Weights
@@ -177,20 +177,16 @@ def test_a_rendered_photograph_is_seen_whole(monkeypatch, capsys, tmp_path, rend
     assert 2 * 96 * 96 < changed.sum() < 0.1 * changed.size  # two drawings, names and outlines, and nothing else
 
 
-def test_networks_that_draw_are_those_with_latent_poses(monkeypatch):
-    """What is drawn is the decoded mean; other architectures draw nothing."""
+def test_networks_with_latent_poses_draw_what_they_mean(monkeypatch):
+    """What is drawn is the decoded mean; networks that only estimate poses draw nothing."""
     weights = Weights(WEIGHTS / "pantry")
-    latents = np.zeros((2, 8), np.float32)
-    latents[1] = 1.0
-    nothing = RedThings().see(np.full((60, 60, 3), RED, np.uint8), INTRINSICS_PX, (0.0, 1.0, 0.0))
-    told = dataclasses.replace(nothing, latent_mean=latents)
-    decoder = decoder_of(weights, "soup_can")
-    first, second = (drawing_of(decoder, told, k) for k in (0, 1))
+    artist = artist_of(weights, "soup_can")
+    first, second = (drawing_of(artist, np.full(8, value, np.float32), None) for value in (0.0, 1.0))
     assert first.shape == (64, 64, 3)
     assert first.dtype == np.uint8
     assert not np.array_equal(first, second)
     monkeypatch.setattr(weights, "architecture", "posecnn")
-    assert drawing_of(decoder_of(weights, "soup_can"), told, 0) is None
+    assert drawing_of(artist_of(weights, "soup_can"), np.zeros(8, np.float32), None) is None
 
 
 # --- how objects are turned
@@ -208,10 +204,11 @@ def test_a_rotation_is_told_as_the_direction_of_the_camera(told_by):
     modes = Modes(np.stack([rotation, np.eye(3)]), np.log([0.9, 0.1]), np.array([0.1, 0.1]))
     told = dataclasses.replace(base, pixel=pixel[None], **(
         {"modes": [modes]} if told_by == "modes" else {"camera_from_object": pose[None]}))
-    np.testing.assert_allclose(view_of(told, 0, image), (40, 25), atol=1e-6)
+    np.testing.assert_allclose(degrees(towards_camera(told, 0, image)), (40, 25), atol=1e-6)
     vague = Modes(modes.rotations, modes.log_probability, np.full(2, np.pi))
-    assert view_of(dataclasses.replace(told, modes=[vague]), 0, image) is None
-    assert view_of(base, 0, image) is None
+    assert towards_camera(dataclasses.replace(told, modes=[vague]), 0, image) is None
+    assert towards_camera(base, 0, image) is None
+    assert degrees(None) is None
 
 
 # --- what it says of files and options

@@ -27,7 +27,7 @@ from saccade.shared.bus.messages import mask_of
 from saccade.shared.config import Config, load
 from saccade.shared.errors import LINE_LIMIT, SaccadeError, printable
 from saccade.shared.files import replace_whole, writing
-from saccade.shared.model.drawing import LatentDecoder
+from saccade.shared.model.drawing import BankPictures, LatentDecoder, drawn
 from saccade.shared.model.weights import WITH_LATENTS, Weights
 from saccade.shared.render.objects import names_in_use
 from saccade.shared.world.geometry import IMAGE_SIZE_PX, INTRINSICS_PX, REFERENCE_RANGE_M, pixel_rays, spherical
@@ -54,7 +54,7 @@ class Looker:
         self.weights = Weights(config.weights)
         self.model: Model = model_of(self.weights, self.names, config.perception.passes)
         self.square: bool = getattr(self.model, "square", True)  # whether the networks take square images only
-        self._decoders = {name: decoder_of(self.weights, name) for name in self.names if draw}
+        self._draw = {name: artist_of(self.weights, name) for name in self.names if draw}
 
     def look(self, photo: Photograph) -> Look:
         """Looks at a photograph."""
@@ -68,13 +68,14 @@ class Looker:
         if self.weights.architecture in ONE_FOCAL_LENGTH:
             range_m *= image.intrinsics_px[0] / image.rgb.shape[1] * IMAGE_SIZE_PX / INTRINSICS_PX[0]
         grid = mask_of(seen.mask_bits[k])
-        return Sight(self.names[k], float(seen.presence[k]), image.back(seen.pixel[k]), range_m,
-                     view_of(seen, k, image), grid, drawing_of(self._decoders.get(self.names[k]), seen, k))
+        name, towards = self.names[k], towards_camera(seen, k, image)
+        return Sight(name, float(seen.presence[k]), image.back(seen.pixel[k]), range_m, degrees(towards), grid,
+                     drawing_of(self._draw.get(name), seen.latent_mean[k], towards))
 
 
-def view_of(seen: Seen, k: int, image: Fitted) -> tuple[float, float] | None:
-    """Azimuth and elevation of the camera around object k in degrees, by its likeliest rotation. None if the networks
-    tell no rotation, or do not know it."""
+def towards_camera(seen: Seen, k: int, image: Fitted) -> NDArray[np.float64] | None:
+    """The direction [3] from object k to the camera in the object's frame, by its likeliest rotation. None if the
+    networks tell no rotation, or do not know it."""
     if seen.modes:
         if seen.modes[k].deviation_rad[0] > VAGUE_RAD:
             return None
@@ -83,24 +84,32 @@ def view_of(seen: Seen, k: int, image: Fitted) -> tuple[float, float] | None:
         camera_from_object = seen.camera_from_object[k, :3, :3]
     else:
         return None
-    towards_camera = -camera_from_object.T @ pixel_rays(seen.pixel[k], image.intrinsics_px)
-    azimuth, elevation, _ = spherical(towards_camera, np.zeros(3))
+    towards: NDArray[np.float64] = -camera_from_object.T @ pixel_rays(seen.pixel[k], image.intrinsics_px)
+    return towards
+
+
+def degrees(towards: NDArray[np.float64] | None) -> tuple[float, float] | None:
+    """Azimuth and elevation of a direction [3] in degrees."""
+    if towards is None:
+        return None
+    azimuth, elevation, _ = spherical(towards, np.zeros(3))
     return math.degrees(azimuth), math.degrees(elevation)
 
 
-def decoder_of(weights: Weights, name: str) -> LatentDecoder | None:
+def artist_of(weights: Weights, name: str) -> LatentDecoder | BankPictures | None:
     """What draws an object. None if networks of this architecture draw nothing."""
+    if weights.architecture == "open":
+        return BankPictures(weights, name)
     return LatentDecoder(weights, name) if weights.architecture in WITH_LATENTS else None
 
 
-def drawing_of(decoder: LatentDecoder | None, seen: Seen, k: int) -> NDArray[np.uint8] | None:
-    """How the networks imagine object k [64, 64, 3]: the mean of its latent pose, decoded. None if there is no
-    decoder."""
-    if decoder is None:
-        return None
-    crop = decoder(seen.latent_mean[k]).clip(0, 1).transpose(1, 2, 0)
-    drawn: NDArray[np.uint8] = (crop * 255 + 0.5).astype(np.uint8)
-    return drawn
+def drawing_of(artist: LatentDecoder | BankPictures | None, latent: NDArray[np.float32],
+               towards: NDArray[np.float64] | None) -> NDArray[np.uint8] | None:
+    """How the networks imagine an object [64, 64, 3], by its latent pose or by the direction from which it is seen.
+    None if nothing draws it, or if that is unknown."""
+    if isinstance(artist, LatentDecoder):
+        return drawn(artist, latent)
+    return None if artist is None or towards is None else artist.picture(towards)
 
 
 def see(paths: Sequence[Path], config: Config, *, agent: str, intrinsics_px: Sequence[float] | None,

@@ -15,13 +15,13 @@ import torch.nn.functional as F
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from saccade.services.perception.bank import FILLED, Bank, bank_of
 from saccade.services.perception.comparer import Compared, Comparison
 from saccade.services.perception.cropping import Cropper
 from saccade.services.perception.proposer import Proposals, Proposer, half_tangent, propose
 from saccade.services.perception.seen import Modes, Seen, bits
 from saccade.services.perception.view_encoder import ViewEncoder
 from saccade.shared.errors import SaccadeError
+from saccade.shared.model.bank import FILLED, Bank, bank_of
 from saccade.shared.model.weights import Weights
 from saccade.shared.world.geometry import REFERENCE_RANGE_M, pixel_rays, pose, project, rotation_towards, unit
 from saccade.shared.world.windows import Window, upright

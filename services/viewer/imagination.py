@@ -1,8 +1,7 @@
 """What the agent's networks see and draw: crops, their reconstructions, and the planned view.
 
-The planned view is drawn object by object with the generative model (paper, section 3.2). The transition moves each
-object's latent pose to the planned viewpoint, the decoder draws it, and the drawing is placed where the object would
-appear according to its belief.
+The planned view is drawn object by object with the generative model (paper, section 3.2), and each drawing is placed
+where the object would appear according to its belief.
 """
 
 from __future__ import annotations
@@ -10,13 +9,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from saccade.services.viewer.artists import ARTISTS
 from saccade.services.viewer.layout import VIEW_PX
 from saccade.shared.bus.messages import Belief, Frame, Percept
 from saccade.shared.errors import SaccadeError
-from saccade.shared.model.drawing import LatentDecoder
-from saccade.shared.model.latent import LatentTransition
-from saccade.shared.model.weights import WITH_LATENTS, Weights
-from saccade.shared.world.geometry import IMAGE_SIZE_PX, INTRINSICS_PX, REFERENCE_RANGE_M, project, spherical, wrap
+from saccade.shared.model.weights import Weights
+from saccade.shared.world.geometry import IMAGE_SIZE_PX, INTRINSICS_PX, REFERENCE_RANGE_M, project
 from saccade.shared.world.windows import CROP_PX, Window
 
 Image = NDArray[np.uint8]
@@ -35,17 +33,16 @@ def ring_of(window: Window, intrinsics_px: ArrayLike, up: ArrayLike) -> NDArray[
 
 
 class Imagination:
-    """The decoders and transitions of a run's objects.
+    """What draws a run's objects.
 
     Raises SaccadeError if an object has no weights, if they do not match the manifest, or if they draw nothing.
     """
 
     def __init__(self, weights: Weights, names: tuple[str, ...]) -> None:
-        if weights.architecture not in WITH_LATENTS:
-            raise SaccadeError(f"networks of the architecture {weights.architecture!r} draw nothing")
         self.cards = {card.name: card for card in weights.cards_of(names)}
-        self._decoders = {name: LatentDecoder(weights, name) for name in names}
-        self._transitions = {name: LatentTransition(weights, name) for name in names}
+        if weights.architecture not in ARTISTS:
+            raise SaccadeError(f"networks of the architecture {weights.architecture!r} draw nothing")
+        self._artists = {name: ARTISTS[weights.architecture](weights, self.cards[name]) for name in names}
 
     def window(self, percepts: list[Percept]) -> Window:
         """The crop windows of these percepts."""
@@ -66,8 +63,9 @@ class Imagination:
         return np.where(inside[..., None], frame.rgb[row.clip(0, height - 1), column.clip(0, width - 1)], np.uint8(0))
 
     def reconstructions(self, percepts: list[Percept]) -> Image:
-        """The reconstructions [K, 64, 64, 3] of K percepts: the means of their latent poses, decoded."""
-        return self._draw({p.object: p.latent_mean for p in percepts})
+        """How the networks imagine what K percepts see [K, 64, 64, 3]."""
+        drawn = [self._artists[percept.object].as_seen(percept) for percept in percepts]
+        return np.array(drawn, np.uint8).reshape(-1, CROP_PX, CROP_PX, 3)
 
     def planned_view(self, viewpoint: NDArray[np.float64], beliefs: list[Belief], seen: dict[str, Percept]) -> Image:
         """How the objects of these beliefs would look from `viewpoint` [4, 4]: an image [240, 240, 3].
@@ -79,29 +77,18 @@ class Imagination:
         intrinsics = np.array(INTRINSICS_PX) * scale
         center, depth = project(np.array([b.mean_m for b in beliefs]).reshape(-1, 3), viewpoint, intrinsics)
         order = [k for k in np.argsort(-depth) if depth[k] > 0 and beliefs[k].object in seen]  # the nearest last
-        crops = self._draw({beliefs[k].object: self._moved(viewpoint, beliefs[k], seen[beliefs[k].object])
-                            for k in order})
-        for k, crop in zip(order, crops, strict=True):
+        for k in order:
+            drawn = self._artists[beliefs[k].object].moved(viewpoint, beliefs[k], seen[beliefs[k].object])
             away = np.linalg.norm(beliefs[k].mean_m - viewpoint[:3, 3])
-            window = Window(center[k:k + 1], np.array([REFERENCE_RANGE_M / away]),
-                            np.array([self.cards[beliefs[k].object].crop_side_m]))
+            window = Window(center[k:k + 1], np.array([REFERENCE_RANGE_M / away]), np.array([drawn.side_m]))
             ring = ring_of(window, intrinsics, viewpoint[2, :3]).clip(0, VIEW_PX)
             (left, top), (right, bottom) = np.floor(ring.min(0)).astype(int), np.ceil(ring.max(0)).astype(int)
             grid = np.stack(np.meshgrid(np.arange(left, right), np.arange(top, bottom)), axis=-1)
             at = window.crop_of(grid.reshape(-1, 2) + 0.5, intrinsics, viewpoint[2, :3])[0].reshape(grid.shape)
-            inside = (np.abs(at) < 1).all(axis=-1)  # false for NaN, which means behind the crop's camera
+            at = drawn.place(at)
+            inside = np.asarray((np.abs(at) < 1).all(axis=-1))  # false for NaN: behind the crop's camera
             column, row = (np.where(inside[..., None], at + 1, 0) / 2 * CROP_PX).astype(np.int64).transpose(2, 0, 1)
-            drawn = crop[row, column]
-            shown = inside & (drawn.max(axis=-1) > DARK)
-            view[top:bottom, left:right][shown] = drawn[shown]
+            crop = drawn.crop[row, column]
+            shown = inside & (crop.max(axis=-1) > DARK)
+            view[top:bottom, left:right][shown] = crop[shown]
         return view
-
-    def _moved(self, viewpoint: NDArray[np.float64], belief: Belief, seen: Percept) -> NDArray[np.float32]:
-        """The latent pose of the percept `seen`, moved to the viewpoint [L]."""
-        azimuth, elevation, _ = spherical(np.stack([seen.world_from_camera[:3, 3], viewpoint[:3, 3]]), belief.mean_m)
-        moved = np.array([[wrap(azimuth[1] - azimuth[0]), elevation[1] - elevation[0]]])
-        return self._transitions[belief.object](seen.latent_mean, moved)[0][0]
-
-    def _draw(self, latents: dict[str, NDArray[np.float32]]) -> Image:
-        drawn = [self._decoders[name](latent).clip(0, 1).transpose(1, 2, 0) for name, latent in latents.items()]
-        return (np.array(drawn).reshape(-1, CROP_PX, CROP_PX, 3) * 255 + 0.5).astype(np.uint8)

@@ -1,6 +1,6 @@
-"""p(o | p) in NumPy: draws crops from latent poses without PyTorch (paper, section 3.2 and table 6).
+"""p(o | p) in NumPy: draws crops from latent poses without PyTorch (paper, section 3.2 and table 6), or from banks.
 
-It computes the same as `Decoder` and `PaperDecoder` in `shared/model/generative_model.py`, which training and
+The decoder computes the same as `Decoder` and `PaperDecoder` in `shared/model/generative_model.py`, which training and
 perception use.
 """
 
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from saccade.shared.errors import SaccadeError
+from saccade.shared.model.bank import bank_of
 from saccade.shared.model.latent import LEAK
 from saccade.shared.model.weights import Weights
 
@@ -45,6 +46,34 @@ class LatentDecoder:
         for layer in self._layers:
             x = layer(x)
         return x
+
+
+def drawn(decoder: LatentDecoder, latent: Array) -> NDArray[np.uint8]:
+    """The crop on black [64, 64, 3] of a latent mean [L], as an image."""
+    image: NDArray[np.uint8] = (decoder(latent).clip(0, 1).transpose(1, 2, 0) * 255 + 0.5).astype(np.uint8)
+    return image
+
+
+class BankPictures:
+    """Shows one object from its bank. Raises SaccadeError if the bank is missing or damaged."""
+
+    def __init__(self, weights: Weights, name: str) -> None:
+        try:
+            self.bank = bank_of(name, weights.bank(name))
+        except (ValueError, KeyError) as error:
+            raise SaccadeError(f"bank of {name} in {weights.folder} is damaged ({error}): make it again") from error
+
+    def nearest(self, towards: NDArray[np.float64]) -> int:
+        """The view that is nearest to a direction [3] from the object to the camera."""
+        return int(np.argmax(self.bank.directions @ towards))
+
+    def view(self, number: int) -> NDArray[np.uint8]:
+        """A view on black [64, 64, 3]."""
+        return self.bank.image(number)[..., :3]
+
+    def picture(self, towards: NDArray[np.float64]) -> NDArray[np.uint8]:
+        """The nearest view to a direction [3], on black [64, 64, 3]."""
+        return self.view(self.nearest(towards))
 
 
 def _default(state: dict[str, Array]) -> tuple[list, list[Layer]]:

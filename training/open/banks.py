@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from saccade.services.perception.bank import VIEWS, Bank, compressed
 from saccade.services.perception.view_encoder import ViewEncoder
+from saccade.shared.model.bank import VIEWS, Bank, compressed
 from saccade.shared.render.mesh import Mesh
 from saccade.shared.render.views import crop_side_m
 from saccade.training.open.composer import CropMaker

@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from saccade.services.perception.bank import FILLED
+from saccade.shared.model.bank import FILLED
 from saccade.shared.render.surfaces import SURFACES
 from saccade.shared.world.windows import CROP_PX
 from saccade.training.crops import warp

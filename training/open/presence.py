@@ -10,9 +10,9 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
-from saccade.services.perception.bank import FILLED, Bank
 from saccade.services.perception.comparer import Compared
 from saccade.services.perception.open_world import LogOdds, OpenWorld
+from saccade.shared.model.bank import FILLED, Bank
 from saccade.training.open.proposer import circles_px
 from saccade.training.open.table_crops import INTRINSICS, TableCrops
 

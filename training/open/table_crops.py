@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
-from saccade.services.perception.bank import FILLED
+from saccade.shared.model.bank import FILLED
 from saccade.shared.render.mesh import Mesh
 from saccade.shared.world.geometry import IMAGE_SIZE_PX, INTRINSICS_PX, circle_around, rotation_towards, unit
 from saccade.shared.world.windows import CROP_PX, upright
