@@ -18,6 +18,7 @@ from saccade.shared.wording import MODULE, TOKEN, WORLD, plain_of
 PACKAGE = Path(__file__).resolve().parent.parent  # the folder of `saccade`: in a checkout the repository
 PRESETS, WEIGHTS = PACKAGE / "shared" / "presets", PACKAGE / "weights"
 
+BUILT_IN_SETS = ("pantry", "ycb")
 MAX_FILE_BYTES = 1 * MIB
 MAX_TEXT = 1024  # characters of a value; paths are the longest
 MANY = 1_000_000  # limit for steps, scenes and the like; more would never end
@@ -62,11 +63,34 @@ class BusConfig(Section):
     """First step of an episode. The replay of a log that was cut begins later than at 0."""
 
 
+def sets_folder() -> Path:
+    """Where the user's own object sets lie: SACCADE_OBJECTS if it is set, otherwise a folder of the user's data."""
+    data = Path(os.environ.get("XDG_DATA_HOME", Path.home() / ".local" / "share"))
+    return Path(os.environ.get("SACCADE_OBJECTS", data / "saccade" / "objects"))
+
+
+def set_folder(objects: str) -> Path | None:
+    """The folder of an object set of the user's. None if the set is built in."""
+    if objects in BUILT_IN_SETS:
+        return None
+    return Path(objects) if _is_path(objects) else sets_folder() / objects
+
+
+def learned_folder(objects: str, architecture: str) -> Path:
+    """Where the weights for an object set are kept."""
+    suffix, folder = "" if architecture == "default" else f"-{architecture}", set_folder(objects)
+    return WEIGHTS / f"{objects}{suffix}" if folder is None else folder / f"weights{suffix}"
+
+
+def _is_path(objects: str) -> bool:
+    return os.sep in objects or objects in (".", "..") or objects.startswith("~")
+
+
 class SceneConfig(Section):
     """Which objects there are, and which episodes are run: those of a scenes file, or drawn from the seed."""
 
-    objects: Literal["pantry", "ycb"] = "pantry"
-    """Object set."""
+    objects: str = Field("pantry", min_length=1)
+    """Object set: `pantry`, `ycb`, the name of one of your own, or the folder of one."""
     names: tuple[str, ...] | None = None
     """Only these objects of the set."""
     file: Path | None = None
@@ -85,6 +109,12 @@ class SceneConfig(Section):
     """fx, fy, cx, cy of the goal image, in pixels. Without them, its EXIF data are asked."""
     explore: bool = False
     """No goal: the agent finds out what is on the table."""
+
+    @field_validator("objects")
+    @classmethod
+    def _whole_path(cls, value: str) -> str:
+        """A folder is held whole, because services and replays may run elsewhere."""
+        return str(Path(value).expanduser().resolve()) if _is_path(value) else value
 
     @property
     def goal_view_is_known(self) -> bool:
@@ -241,8 +271,7 @@ class Config(Section):
     @property
     def weights(self) -> Path:
         """The folder of the weights in use."""
-        suffix = "" if self.perception.architecture == "default" else f"-{self.perception.architecture}"
-        return self.perception.weights or WEIGHTS / f"{self.scene.objects}{suffix}"
+        return self.perception.weights or learned_folder(self.scene.objects, self.perception.architecture)
 
     @property
     def names(self) -> tuple[str, ...]:

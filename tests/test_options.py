@@ -10,7 +10,7 @@ from saccade.tests.front_door import call
 @pytest.mark.parametrize(("arguments", "words"), [
     (("run", "--seed", "-1"), "--seed -1: give 0 or more"),
     (("run", "--seed", "x"), "--seed x: give a whole number"),
-    (("run", "--objects", "apples"), "--objects apples: choose from pantry, ycb"),
+    (("run", "--objects", "apples"), "object set 'apples' is not there, or has no objects"),
     (("run", "--count", "0"), "--count 0: give 1 or more"),
     (("run", "--fast"), "No such option: --fast"),
     (("run", "--seed"), "Option '--seed' requires an argument: see `saccade"),

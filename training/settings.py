@@ -57,7 +57,7 @@ class TrainingConfig(Section):
     If the architecture is "default", the settings that only others have are not saved.
     """
 
-    objects: Literal["pantry", "ycb"] = "pantry"
+    objects: str = "pantry"
     names: tuple[str, ...]
     seed: int = Field(0, ge=0)
     views: int = Field(500, ge=20, le=5000)

@@ -37,21 +37,21 @@ def train(*, objects: Objects = None, names: Names = None,
     """Train the networks of an object set. The same command continues after an interruption."""
     from rich.console import Console
 
-    from saccade.shared.config import WEIGHTS, SceneConfig
+    from saccade.shared.config import SceneConfig, learned_folder
     from saccade.shared.render.objects import names_in_use
     from saccade.training.run import export
     from saccade.training.run import train as run_training
     from saccade.training.settings import settings_from
 
-    object_set = objects or "pantry"
+    object_set = SceneConfig(objects=objects or "pantry").objects
     given = {"seed": seed, "steps_ccn": steps_ccn, "steps_extraction": steps_extraction, "views": views,
              "device": device, "architecture": architecture}
     chosen = names_in_use(SceneConfig(objects=object_set, names=split_names(names)))
     settings = settings_from({"objects": object_set, "names": chosen}
                              | {k: v for k, v in given.items() if v is not None}
                              | dict(parse_value(text) for text in values or ()))
-    name = object_set if architecture == "default" else f"{object_set}-{architecture}"
-    folder, target = out or Path("training_runs") / name, weights or WEIGHTS / name
+    name = Path(object_set).name + ("" if architecture == "default" else f"-{architecture}")
+    folder, target = out or Path("training_runs") / name, weights or learned_folder(object_set, architecture)
     run_training(folder, settings, jobs=jobs, console=Console())
     export(folder, target)
     print(f"weights written to {target}")

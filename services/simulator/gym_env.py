@@ -46,7 +46,7 @@ class ActiveSearch(gymnasium.Env[Observation, NDArray[np.float64]]):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 - Gymnasium's interface
 
-    def __init__(self, *, objects: Literal["pantry", "ycb"] = "pantry", names: Sequence[str] | None = None,
+    def __init__(self, *, objects: str = "pantry", names: Sequence[str] | None = None,
                  n_objects: int | None = None, yaw: Literal["random", "fixed"] = "random",
                  scenes: str | Path | None = None,
                  max_steps: int = MAX_STEPS, size_px: int = IMAGE_SIZE_PX, render_mode: str | None = None):

@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
+from saccade.shared.config import WEIGHTS
 from saccade.shared.errors import SaccadeError, is_text, told
 from saccade.shared.files import MIB, parse_json, read_bytes, read_text, replace_all, writing
 
@@ -83,7 +84,8 @@ class Weights:
         name = self.manifest.get("networks")
         if not isinstance(name, str):
             raise SaccadeError(f"weights manifest {self.folder / MANIFEST} names no networks: {_NEED}")
-        shared = Weights(self.folder.parent / _file_name(name))
+        beside = self.folder.parent / _file_name(name)
+        shared = Weights(beside if beside.is_dir() else WEIGHTS / name)  # an own set's lie with the program
         if shared.architecture != self.architecture:
             raise SaccadeError(f"weights {shared.folder} are of the architecture {shared.architecture!r}, and those in "
                                f"{self.folder} need {self.architecture!r}: {_NEED}")

@@ -17,6 +17,7 @@ from saccade.shared.errors import SaccadeError
 from saccade.shared.files import MIB, opened
 from saccade.shared.world.images import opened_image
 
+MESH_FILE = "textured.obj"
 MAX_FILE_BYTES = 64 * MIB
 MAX_COUNT = 1_000_000  # of faces, of vertices and of texture coordinates: a scan has some ten thousand
 MAX_COORDINATE = 1e4
@@ -49,7 +50,7 @@ def read_obj(folder: Path, name: str) -> Mesh:
 
     Raises SaccadeError, with the path and what to do, if a file is missing or damaged.
     """
-    path = folder / "textured.obj"
+    path = folder / MESH_FILE
     if not os.path.isfile(path):
         raise SaccadeError(f"mesh {path} is missing: set SACCADE_YCB to a folder with {name}/textured.obj in it")
     try:

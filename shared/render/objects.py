@@ -1,18 +1,20 @@
 """The object sets, and where their meshes come from.
 
 The set `pantry` is made by code (`pantry.py`). The set `ycb` is read from the folder that the environment variable
-SACCADE_YCB names, or from the user's cache.
+SACCADE_YCB names, or from the user's cache. Any other set is a folder of the user's, in which each object is a folder.
 """
 
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 
-from saccade.shared.config import SceneConfig
-from saccade.shared.errors import SaccadeError
-from saccade.shared.render.mesh import Mesh, read_obj
+from saccade.shared.config import SceneConfig, set_folder
+from saccade.shared.errors import SaccadeError, told
+from saccade.shared.render.mesh import MESH_FILE, Mesh, read_obj
 from saccade.shared.render.pantry import PANTRY_NAMES, make_mesh
+from saccade.shared.wording import WORLD
 
 YCB_NAMES = ("002_master_chef_can", "003_cracker_box", "004_sugar_box", "005_tomato_soup_can", "006_mustard_bottle")
 
@@ -24,21 +26,37 @@ def ycb_folder() -> Path:
 
 
 def names_of(object_set: str) -> tuple[str, ...]:
-    """The names of the objects in a set. Raises SaccadeError if the set is unknown."""
+    """The names of the objects in a set. Raises SaccadeError if the set is not there, or empty."""
     if object_set == "ycb":
         return YCB_NAMES
     if object_set == "pantry":
         return PANTRY_NAMES
-    raise SaccadeError(f"object set {object_set!r} is unknown: choose pantry or ycb")
+    folder = set_folder(object_set)
+    assert folder is not None  # as the set is not built in
+    names = own_names(folder)
+    if not names:
+        raise SaccadeError(f"object set {told(object_set)} is not there, or has no objects ({folder}): choose pantry, "
+                           "ycb or one of your own, or put a mesh into it with `saccade objects add`")
+    return names
+
+
+def own_names(folder: Path) -> tuple[str, ...]:
+    """The names of the objects in the folder of a set of the user's, in their order. None if there is no such
+    folder."""
+    try:
+        entries = sorted(entry.name for entry in folder.iterdir() if (entry / MESH_FILE).is_file())
+    except OSError:
+        return ()
+    return tuple(name for name in entries if re.fullmatch(WORLD, name))
 
 
 def load_mesh(object_set: str, name: str) -> Mesh:
     """Loads one mesh of a set. Raises SaccadeError if the object is unknown, or if a file is missing or damaged."""
     if name not in names_of(object_set):
         raise SaccadeError(f"object {name!r} is not in {object_set!r}: choose from {', '.join(names_of(object_set))}")
-    if object_set == "ycb":
-        return read_obj(ycb_folder() / name, name)
-    return make_mesh(name)
+    if object_set == "pantry":
+        return make_mesh(name)
+    return read_obj((set_folder(object_set) or ycb_folder()) / name, name)
 
 
 def names_in_use(config: SceneConfig) -> tuple[str, ...]:

@@ -24,7 +24,7 @@ class Room:
     def __init__(self, objects: str, names: tuple[str, ...], folder: Path, length: int) -> None:
         path = folder / "room.json"
         save_scenes(path, room_scenes({name: load_mesh(objects, name).size_m for name in names})[:1])
-        self.environment = ActiveSearch(objects=objects, names=names, scenes=path, max_steps=length,  # type: ignore[arg-type]  # checked by the settings
+        self.environment = ActiveSearch(objects=objects, names=names, scenes=path, max_steps=length,
                                         size_px=FINER * IMAGE_PX)
         self.length = length
 
