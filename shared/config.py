@@ -42,6 +42,7 @@ class Section(BaseModel):
 Checked = TypeVar("Checked", bound=Section)
 ModuleName = Annotated[str, Field(pattern=MODULE)]
 Focal = Annotated[FiniteFloat, Field(gt=0)]
+PosesFormat = Literal["json-lines", "tum", "kitti", "euroc", "transforms", "colmap", "record3d", "stray"]
 
 
 class BusConfig(Section):
@@ -144,9 +145,21 @@ class CameraConfig(Section):
     source: str | None = None
     """A folder of images, a video file, or a webcam (`webcam:0`)."""
     poses: Path | None = None
-    """File with the camera's poses: JSON lines or TUM."""
+    """File or folder with the camera's poses, in one of the formats of the guide's page about the camera."""
     pose_convention: Literal["opengl", "opencv"] | None = None
-    """Camera axes of the poses. Without it, JSON lines are taken as OpenGL and TUM as OpenCV."""
+    """Camera axes of the poses. Without it, those of the format."""
+    poses_format: PosesFormat | None = None
+    """Format of the poses. Without it, it is told from the file."""
+    poses_direction: Literal["world_from_camera", "camera_from_world"] | None = None
+    """Whether a pose maps the camera to the world or the other way. Without it, as the format does."""
+    poses_quaternion: Literal["xyzw", "wxyz"] | None = None
+    """Order of a quaternion's numbers. Without it, that of the format or of its header."""
+    poses_up: Literal["x", "y", "z", "-x", "-y", "-z"] | None = None
+    """Axis of the file's world that points up. Without it, that of the format."""
+    poses_scale: Focal = 1.0
+    """Length in metres of the unit of the poses' positions."""
+    poses_original: bool = False
+    """Undo the `applied_transform` of a transforms.json."""
     intrinsics_px: tuple[Focal, Focal, FiniteFloat, FiniteFloat] | None = None
     """fx, fy, cx, cy of the source's images, in pixels."""
     rate_hz: float = Field(10.0, gt=0, le=1000)

@@ -40,7 +40,8 @@ def run(*, objects: Objects = None, names: Names = None, scenes: ScenesFile = No
             help="Where images come from: simulator, or camera for a real one.")] = "simulator",
         source: Annotated[str | None, typer.Option(
             help="Images of a real camera: a folder, a video file, or a webcam (webcam:0).")] = None,
-        poses: Annotated[Path | None, typer.Option(help="File with the camera's poses: JSON lines or TUM.")] = None,
+        poses: Annotated[Path | None, typer.Option(
+            help="File or folder with the camera's poses, such as TUM, transforms.json or COLMAP.")] = None,
         intrinsics: Annotated[str | None, typer.Option(
             help="Intrinsics of the camera's images, in pixels.", metavar="fx,fy,cx,cy")] = None,
         rate: Annotated[float | None, typer.Option(

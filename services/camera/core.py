@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from saccade.services.camera.poses import Poses, read_poses
+from saccade.services.camera.poses import Poses, asked_of, read_poses
 from saccade.services.camera.sources import Source, SourceImage, open_source
 from saccade.services.camera.virtual_camera import VirtualCamera
 from saccade.shared.bus.messages import Frame, Goal
@@ -17,7 +17,7 @@ from saccade.shared.errors import SaccadeError
 from saccade.shared.loop.service import Inputs, Service
 from saccade.shared.world.geometry import IMAGE_SIZE_PX, INTRINSICS_PX
 from saccade.shared.world.goal_image import LONGEST_PX, GoalImage, read_goal_image
-from saccade.shared.world.photographs import read_photograph
+from saccade.shared.world.photographs import Intrinsics, read_photograph
 from saccade.shared.world.task import start_pose
 
 SERVICE = Service("camera", inputs=(ACTION,), trigger=ACTION, outputs=(FRAME, GOAL))
@@ -92,10 +92,13 @@ def build(config: Config) -> Camera:
     if camera.source is None:
         raise SaccadeError("camera.source is not given: give a folder of images, a video file, or a webcam (webcam:0)")
     source = open_source(camera.source, rate_hz=camera.rate_hz)
-    virtual_camera = VirtualCamera(source.size_px, camera.intrinsics_px)
-    poses = Poses.still(start_pose()) if camera.poses is None else read_poses(camera.poses, camera.pose_convention)
+    poses = Poses.still(start_pose()) if camera.poses is None else read_poses(camera.poses, asked=asked_of(camera))
+    poses = poses.matched([path.name for path in getattr(source, "paths", ())])
+    intrinsics_px, told = (camera.intrinsics_px, ()) if camera.intrinsics_px else poses.intrinsics_px(source.size_px)
+    virtual_camera = VirtualCamera(source.size_px, intrinsics_px)
     goal = _goal_of(config, virtual_camera)
-    notes = (*_notes(config, virtual_camera), *((goal.note,) if goal else ()))
+    assumed = _notes(config, virtual_camera, intrinsics_px)
+    notes = (*poses.notes, *told, *assumed, *((goal.note,) if goal else ()))
     return Camera(source, poses, virtual_camera, goal_rgb=goal.rgb if goal else None, loop=camera.loop, notes=notes)
 
 
@@ -117,10 +120,10 @@ def _goal_of(config: Config, virtual_camera: VirtualCamera) -> GoalImage | None:
     return read_goal_image(scene.goal_image, scene.goal_intrinsics_px)
 
 
-def _notes(config: Config, virtual_camera: VirtualCamera) -> tuple[str, ...]:
+def _notes(config: Config, virtual_camera: VirtualCamera, intrinsics_px: Intrinsics | None) -> tuple[str, ...]:
     """Texts for the user, one line each: what is assumed because it is not given, and whether grey is filled in."""
     notes = []
-    if config.camera.intrinsics_px is None:
+    if intrinsics_px is None:
         notes.append("camera.intrinsics_px is not given: the central square of each image, resized to "
                      f"{IMAGE_SIZE_PX}x{IMAGE_SIZE_PX} pixels, is assumed to have the simulator's intrinsics (focal "
                      f"length {INTRINSICS_PX[0]:.0f} px); if the true focal length differs, ranges are wrong by the "

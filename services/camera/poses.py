@@ -1,54 +1,52 @@
-"""The camera's pose at each image, read from a file of JSON lines or in the TUM trajectory format.
+"""The camera's pose at each image, from a file in one of many formats (see `trajectories/`).
 
 Poses are in the agent's world: metres, z up, table top at z = 0.
-JSON lines: `{"image": "a.png", "world_from_camera": 4x4}`, with "index" (from 0) or "time_s" in place of "image". A
-camera that stands still has one line without any of the three.
-TUM: `timestamp tx ty tz qx qy qz qw`, the pose of the camera in the world.
-Blank lines, and lines that begin with #, are ignored.
 """
 
 from __future__ import annotations
 
-import io
-import math
-from dataclasses import dataclass
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import islice
 from pathlib import Path
-from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation, Slerp
 
 from saccade.services.camera.sources import SourceImage
-from saccade.shared.errors import SaccadeError, printable, told
-from saccade.shared.files import MIB, parse_json, read_text
+from saccade.services.camera.trajectories.lens import Lens, one_lens
+from saccade.services.camera.trajectories.reading import read_trajectory
+from saccade.services.camera.trajectories.text import MAX_POSES
+from saccade.services.camera.trajectories.trajectory import EPOCH_S, STILL, Asked, Axes, Key
+from saccade.shared.config import CameraConfig
+from saccade.shared.errors import printable
 from saccade.shared.world.geometry import Array, pose
+from saccade.shared.world.images import Size
+from saccade.shared.world.photographs import Intrinsics
 
-Convention = Literal["opengl", "opencv"]  # the camera looks along -z with +y up, or along +z with +y down
-Key = tuple[str, str | int | float | None]  # how a pose is assigned (image, index, time_s or still), and the value
+__all__ = ["MAX_POSES", "Poses", "asked_of", "read_poses"]
 
-MAX_FILE_BYTES, MAX_POSES, MAX_LINE = 64 * MIB, 500_000, 4096
-MAX_M = 1e5  # from the origin: nothing is seen from further away
-_NEED = "give JSON lines or the TUM format"
 MAX_GAP_S = 1.0  # poses are not interpolated across a longer gap, because the camera's path there is unknown
 HOLD_S = 0.1  # a pose also holds for images this long before and after it
-ORTHONORMAL = 1e-3  # largest error of R^T R that is accepted: poses are written with four digits or more
-UNIT_QUATERNION = 1e-2  # largest error of a quaternion's length that is accepted
-STILL: Key = ("still", None)
-_OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+UNITS_S = (1e-9, 1e-6, 1e-3, 1.0)  # of a time since 1970 in an image's name
 
 
 @dataclass(frozen=True)
 class Poses:
     """Poses world_from_camera [4, 4] (OpenGL) by the file name, the index or the time of an image.
 
-    A camera that stands still has one pose for all images (STILL).
+    A camera that stands still has one pose for all images (STILL). Times are counted from `epoch_s`. `lenses` are those
+    that the file tells of: none, one, or one for each pose. `notes` tells the user what was taken, one line each.
+    With `in_order`, images without names get the poses in the order of their names.
     """
 
     table: dict[Key, Array]
     name: str = ""
+    epoch_s: float = 0.0
+    lenses: tuple[Lens, ...] = ()
+    notes: tuple[str, ...] = ()
+    in_order: bool = False
 
     @classmethod
     def still(cls, world_from_camera: Array) -> Poses:
@@ -57,22 +55,65 @@ class Poses:
 
     def of(self, image: SourceImage) -> Array | None:
         """The camera's pose [4, 4] at an image. None if it is not known."""
-        for key in (STILL, ("image", image.name), ("index", image.index)):
+        for key in (STILL, ("image", image.name), ("image", Path(image.name).stem), ("index", image.index)):
             if key in self.table:
                 return self.table[key]
-        return self._at(image.time_s)
+        if self.in_order and not image.name and image.index < len(self._in_order):  # an image of a video
+            return self.table[self._in_order[image.index]]
+        return self._at(self._time_s(image))
 
     def end_before(self, image: SourceImage) -> bool:
         """Whether neither this image nor a later one can have a pose: all poses are by time, and all are past."""
         times = self._times_s
         return 0 < len(times) == len(self.table) and image.time_s > times[-1] + HOLD_S
 
+    def matched(self, names: Sequence[str]) -> Poses:
+        """The poses for images with these names, in order, if they come from a format that names other images.
+
+        If only the endings differ (`a.png` and `a.jpg`), they do not count. If no image has the name of a pose, and
+        there are as many images as poses, the poses are taken in the order of their names.
+        """
+        if not self.in_order or not names or any(("image", name) in self.table for name in names):
+            return self
+        stems = {Path(str(name)).stem: self.table[kind, name] for kind, name in self._in_order}
+        if len(stems) == len(self.table) and not stems.keys().isdisjoint(Path(name).stem for name in names):
+            return replace(self, table={("image", stem): matrix for stem, matrix in stems.items()})
+        if not len(names) == len(self._in_order) == len(self.table):
+            return self
+        note = f"no image has the name of a pose: the {len(names)} poses are taken in the order of their names"
+        return replace(self, table={("index", k): self.table[key] for k, key in enumerate(self._in_order)},
+                       notes=(*self.notes, note))
+
+    def intrinsics_px(self, size_px: Size) -> tuple[Intrinsics | None, tuple[str, ...]]:
+        """The intrinsics (fx, fy, cx, cy) that the file tells for images of this size (width, height), and notes. None
+        if it tells none. Raises SaccadeError if they are those of other images or of several cameras."""
+        lens, note = one_lens(self.lenses)
+        if lens is None:
+            return None, ()
+        taken = lens.of(size_px)
+        told = f"intrinsics ({', '.join(f'{x:.2f}' for x in taken)}) px are those of the poses' file"
+        return taken, (told, *((note,) if note else ()))
+
     @cached_property
     def _times_s(self) -> Array:
         return np.array(self._keys("time_s"), dtype=np.float64)
 
+    @cached_property
+    def _in_order(self) -> list[Key]:
+        """The keys of the poses that are assigned by name; `2.png` comes before `10.png`."""
+        return sorted((key for key in self.table if key[0] == "image"), key=lambda key: _natural(str(key[1])))
+
     def _keys(self, kind: str) -> list:
         return sorted(value for what, value in self.table if what == kind)
+
+    def _time_s(self, image: SourceImage) -> float:
+        """The image's time in seconds: by its name, if poses and name are counted since 1970."""
+        stem = Path(image.name).stem
+        if self.epoch_s and re.fullmatch(r"[0-9]{9,19}(\.[0-9]{0,9})?", stem):
+            for unit_s in UNITS_S:
+                if float(stem) * unit_s >= EPOCH_S:
+                    return float(stem) * unit_s - self.epoch_s
+        return image.time_s
 
     def _at(self, time_s: float) -> Array | None:
         """The pose [4, 4] at a time. None if there is none near enough.
@@ -98,99 +139,26 @@ class Poses:
         return f"{self.name} ({'; '.join(parts)})"
 
 
-def read_poses(path: Path, convention: Convention | None = None) -> Poses:
-    """Reads the poses of a file and converts them from `convention` to OpenGL.
+def _natural(name: str) -> tuple[list[str | int], str]:
+    parts = re.split(r"(\d{1,18})", name)  # text and digits by turns
+    return [int(part) if k % 2 else part.casefold() for k, part in enumerate(parts)], name
 
-    Without a convention, JSON lines are OpenGL and TUM trajectories are OpenCV. Raises SaccadeError if the file cannot
-    be read. Raises SaccadeError with file:line if a line is damaged, has no valid rotation, or repeats another line.
+
+def asked_of(camera: CameraConfig) -> Asked:
+    """What a configuration says about the file of the poses."""
+    return Asked(format=camera.poses_format, axes=camera.pose_convention, direction=camera.poses_direction,
+                 quaternion=camera.poses_quaternion, up=camera.poses_up, scale=camera.poses_scale,
+                 original=camera.poses_original)
+
+
+def read_poses(path: Path, convention: Axes | None = None, asked: Asked | None = None) -> Poses:
+    """Reads the poses of a file or folder, and converts them from `convention` to OpenGL.
+
+    `asked` says more about the file than its convention. Without either, the format decides: JSON lines are OpenGL and
+    TUM trajectories are OpenCV. Raises SaccadeError if the file cannot be read. Raises SaccadeError with file:line or
+    the frame if one is damaged, has no valid rotation, or repeats another.
     """
-    lines = _lines(path)
-    is_json = lines[0][1].startswith("{")
-    opencv = (convention or ("opengl" if is_json else "opencv")) == "opencv"
-    table: dict[Key, Array] = {}
-    for number, line in lines:
-        try:
-            key, world_from_camera = _json_line(line) if is_json else _tum_line(line)
-            if key in table:
-                raise ValueError(f"a second pose for {key[0]} {printable(str(key[1]), 100)}")
-            if table and STILL in (key, *table):
-                raise ValueError("a pose without image, index or time_s holds for all images: give no other pose")
-        except (ValueError, OverflowError) as error:
-            raise SaccadeError(f"poses {path}:{number}: {error}") from error
-        table[key] = world_from_camera @ _OPENCV_FROM_OPENGL if opencv else world_from_camera
-    return Poses(table, str(path))
-
-
-def _lines(path: Path) -> list[tuple[int, str]]:
-    """The lines that are neither blank nor comments, with their numbers. Raises SaccadeError if there are none."""
-    text = io.StringIO(read_text(path, "poses", _NEED, MAX_FILE_BYTES))
-    numbered = enumerate(map(str.strip, text), start=1)
-    lines = list(islice(((n, line) for n, line in numbered if line and not line.startswith("#")), MAX_POSES + 1))
-    if not lines:
-        raise SaccadeError(f"poses {path} holds no pose: {_NEED}")
-    if len(lines) > MAX_POSES:
-        raise SaccadeError(f"poses {path} holds more than {MAX_POSES} poses: leave out what no image needs")
-    if too_long := next((n for n, line in lines if len(line) > MAX_LINE), None):
-        raise SaccadeError(f"poses {path}:{too_long}: a line of more than {MAX_LINE} characters: {_NEED}")
-    return lines
-
-
-def _json_line(line: str) -> tuple[Key, Array]:
-    try:
-        tree: Any = parse_json(line)
-    except ValueError as error:
-        raise ValueError(f"not JSON ({error})") from error
-    if not isinstance(tree, dict) or "world_from_camera" not in tree or len(tree) > 2:
-        raise ValueError('give {"world_from_camera": 4x4} and one of image, index and time_s')
-    kind, value = next(((k, v) for k, v in tree.items() if k != "world_from_camera"), STILL)
-    kinds: dict[str, Any] = {"image": str, "index": int, "time_s": (int, float), "still": type(None)}
-    if kind not in kinds:
-        raise ValueError(f"unknown key {told(kind)}: give one of image, index and time_s")
-    if not isinstance(value, kinds[kind]) or isinstance(value, bool):
-        raise ValueError(f"{kind}: {told(value)} is not a {'text' if kind == 'image' else 'number'}")
-    if kind == "time_s" and not math.isfinite(value):
-        raise ValueError(f"time_s: {value} is not finite")
-    if kind == "index" and not 0 <= value < 2 ** 63:
-        raise ValueError("index: no image has such a number")
-    return (kind, value), rigid(tree["world_from_camera"])
-
-
-def _tum_line(line: str) -> tuple[Key, Array]:
-    try:
-        time_s, *rest = (float(word) for word in line.split())
-    except ValueError:
-        rest = []
-    if len(rest) != 7:
-        raise ValueError("neither a JSON object nor the eight numbers of TUM: timestamp tx ty tz qx qy qz qw")
-    if not np.isfinite([time_s, *rest]).all():
-        raise ValueError("not finite")
-    if max(map(abs, rest)) > MAX_M:
-        raise ValueError(f"a number beyond {MAX_M:g}")
-    length = float(np.linalg.norm(rest[3:]))
-    if abs(length - 1.0) > UNIT_QUATERNION:
-        raise ValueError(f"the quaternion has length {length:.3f}, not 1")
-    return ("time_s", time_s), pose(Rotation.from_quat(rest[3:]).as_matrix(), rest[:3])
-
-
-def rigid(matrix: ArrayLike) -> Array:
-    """A rigid transform [4, 4] whose rotation is made orthonormal. Raises ValueError if the matrix is not rigid."""
-    try:
-        transform = np.array(matrix, dtype=np.float64)
-    except (TypeError, ValueError):
-        transform = np.empty(0)
-    if transform.shape != (4, 4):
-        raise ValueError("world_from_camera is not 4x4 numbers")
-    if not np.isfinite(transform).all():
-        raise ValueError("world_from_camera is not finite")
-    if np.abs(transform).max() > MAX_M:
-        raise ValueError(f"world_from_camera has a number beyond {MAX_M:g}")
-    if not np.allclose(transform[3], (0, 0, 0, 1), atol=1e-9):
-        raise ValueError("world_from_camera does not end in the row 0 0 0 1: is it transposed?")
-    rotation = transform[:3, :3]
-    error = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
-    if error > ORTHONORMAL:
-        raise ValueError(f"the rotation is not orthonormal (R^T R is off by {error:.2g})")
-    if np.linalg.det(rotation) < 0:
-        raise ValueError("the rotation mirrors (determinant -1)")
-    u, _, vt = np.linalg.svd(rotation)
-    return pose(u @ vt, transform[:3, 3])
+    read = read_trajectory(path, asked or Asked(axes=convention))
+    notes = () if read.usual else (read.told, *read.notes)
+    table: dict[Key, Array] = dict(zip(read.keys, read.world_from_camera, strict=True))
+    return Poses(table, str(path), read.epoch_s, read.lenses, notes, in_order=read.format in ("transforms", "colmap"))
