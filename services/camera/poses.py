@@ -92,6 +92,8 @@ class Poses:
             return None, ()
         taken = lens.of(size_px)
         told = f"intrinsics ({', '.join(f'{x:.2f}' for x in taken)}) px are those of the poses' file"
+        if lens.intrinsics_px is not None and lens.size_px is None:
+            told += f", which does not tell their size: {size_px[0]}x{size_px[1]} pixels are taken"
         return taken, (told, *((note,) if note else ()))
 
     @cached_property

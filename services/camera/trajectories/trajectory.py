@@ -78,7 +78,8 @@ class Trajectory:
 
     `keys` says for each pose which image it belongs to: by name, by number from 0, or by time in seconds. `times_s` [N]
     are the times if the file has them, less `epoch_s`. `told` says in one line which format and conventions were
-    taken, `notes` what else the user must know. `usual` is whether nothing was assumed.
+    taken, `notes` what else the user must know. `usual` is whether the file is Saccade's own and nothing else was
+    asked, so that there is nothing to tell.
     """
 
     path: Path
@@ -125,7 +126,7 @@ def in_the_agents_world(stored: Stored, asked: Asked, path: Path) -> Trajectory:
     notes = (*stored.notes, *_notes(stored, asked, up, epoch_s))
     return Trajectory(path, stored.format, keys, pose(turn @ poses[:, :3, :3], positions),
                       _told(stored, asked, path, axes, direction, up), times_s, stored.lenses, notes, epoch_s,
-                      usual=stored.format == "json-lines" and not asked.up and asked.scale == 1.0)
+                      usual=stored.format == "json-lines" and asked == Asked(asked.format, asked.axes))
 
 
 def _since_the_first(stored: Stored) -> tuple[tuple[Key, ...], Array | None, float]:
