@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+import torch.nn.functional as F
 
 from saccade.services.perception.comparer import Compared, Comparison
-from saccade.services.perception.open_world import Match, OpenWorld, Placed, Things, rolled
+from saccade.services.perception.open_world import UNIT, Cohort, Match, OpenWorld, Placed, Things, rolled
 from saccade.services.perception.proposer import STRIDE, Proposer, places, propose
 from saccade.services.perception.view_encoder import VECTOR, ViewEncoder
 from saccade.shared.model.bank import FILLED, Bank, bank_of, compressed
@@ -29,6 +30,7 @@ from saccade.training.open.comparer import turn_between
 from saccade.training.open.table_crops import circle_of
 
 UP = (0.0, 1.0, 0.0)
+STRANGERS = Cohort(F.normalize(torch.randn(60, VECTOR, generator=torch.Generator().manual_seed(1)), dim=1))
 
 
 @pytest.fixture(scope="module")
@@ -142,7 +144,7 @@ def test_where_nothing_votes_nothing_is_proposed():
 @pytest.mark.parametrize("shape", [(480, 480), (300, 640), (97, 63)])
 def test_any_size_is_seen_and_an_empty_picture_shows_nothing(bank, shape):
     torch.manual_seed(1)
-    model = OpenWorld(Proposer(), ViewEncoder(), Comparison(), [bank, bank])
+    model = OpenWorld(Proposer(), ViewEncoder(), Comparison(), [bank, bank], STRANGERS)
     seen = model.see(np.zeros((*shape, 3), dtype=np.uint8), INTRINSICS_PX, UP)
     assert seen.presence.shape == (2,)
     assert len(seen.modes) == 2
@@ -153,11 +155,29 @@ def test_any_size_is_seen_and_an_empty_picture_shows_nothing(bank, shape):
 def test_a_thing_is_one_object_or_none(bank):
     """The probabilities of all objects in one thing sum to less than 1."""
     torch.manual_seed(2)
-    model = OpenWorld(Proposer(), ViewEncoder(), Comparison(), [bank, bank, bank])
+    model = OpenWorld(Proposer(), ViewEncoder(), Comparison(), [bank, bank, bank], STRANGERS)
     matches = model._matches([(k, 0, 0) for k in range(3)], np.array([3.0, 2.0, -4.0]))
     presence = [match.presence for match in matches]
     assert sum(presence) < 1.0
     assert presence[0] == pytest.approx(np.exp(3) / (1 + np.exp(3) + np.exp(2) + np.exp(-4)))
+
+
+def test_a_similarity_counts_by_what_is_usual_for_the_crop_and_for_the_view():
+    """A view that is like everything counts less than one that is like this crop alone, at the same similarity."""
+    crop = F.normalize(torch.tensor([[1.0, 1.0, 0.0, 0.0]]), dim=1)
+    plain, special = torch.eye(4)[0], torch.eye(4)[1]
+    strangers = F.normalize(plain + 0.3 * torch.randn(40, 4, generator=torch.Generator().manual_seed(3)), dim=1)
+    cohort = Cohort(strangers)
+    views = torch.stack([plain, special])
+    similar = crop @ views.T
+    assert float(similar[0, 0]) == pytest.approx(float(similar[0, 1]))
+    normalised = cohort.normalised(similar, cohort.likest(crop), cohort.likest(views))
+    assert float(normalised[0, 1]) > float(normalised[0, 0]) + UNIT
+    # Where every similarity is smaller by the same, as in a blurred crop, nothing changes by the crop's half.
+    mean, std = cohort.likest(crop)
+    shifted = cohort.normalised(similar - 0.2, (mean - 0.2, std), cohort.likest(views))
+    by_view = UNIT / 2 * 0.2 / cohort.likest(views)[1].T
+    assert (normalised - shifted).numpy() == pytest.approx(by_view.numpy(), abs=1e-6)
 
 
 def test_a_bank_is_small_and_reads_as_it_was_written(bank):

@@ -15,6 +15,7 @@ import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
+from saccade.services.perception.open_world import COHORT
 from saccade.services.perception.paper import CROP_SIDE_M
 from saccade.shared.errors import SaccadeError
 from saccade.shared.files import replace_whole, writing
@@ -25,7 +26,7 @@ from saccade.shared.render.views import crop_side_m
 from saccade.training.checkpoints import ccn_of, finished
 from saccade.training.dataset import render_missing
 from saccade.training.open.material import prepare
-from saccade.training.open.tasks import banks_for, log_odds_for
+from saccade.training.open.tasks import banks_for, judged
 from saccade.training.part import pick_device
 from saccade.training.settings import EXTRACTION, WHOLE, TrainingConfig, load_settings
 
@@ -161,8 +162,9 @@ def _export_open(run_dir: Path, config: TrainingConfig, weights_dir: Path) -> No
         losses = {part: json.loads((run_dir / part / "losses.jsonl").read_text().splitlines()[-1])
                   for part in config.parts}
         states = {part: state for part, (_, state) in trained.items()}
-        write_weights(networks, states, (), {
-            "architecture": config.architecture, "calibration": asdict(log_odds_for(run_dir, config, states)),
+        cohort, log_odds = judged(run_dir, config, states)
+        write_weights(networks, {**states, COHORT: {"vectors": cohort}}, (), {
+            "architecture": config.architecture, "calibration": asdict(log_odds),
             "data": "views and rendered tables of scanned objects, the pantry's, and of "
             f"{config.groceries} groceries made by code", "training": config.model_dump(mode="json"), "losses": losses,
             "commits": {part: facts.get("commit", "unknown") for part, (facts, _) in trained.items()},

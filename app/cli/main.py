@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from saccade.app.cli import bench, log, look, poses, replay, run, train
+from saccade.app.cli import bench, log, look, objects, poses, replay, run, train
 from saccade.app.cli.front import FrontDoor, command_of
 from saccade.app.run.threads import prefer_one_thread
 from saccade.shared.errors import LINE_LIMIT, SaccadeError, printable
@@ -43,6 +43,7 @@ for commands in (run, replay, bench, train, look):
     app.add_typer(commands.app)
 app.add_typer(log.app, name="log")
 app.add_typer(poses.app, name="poses")
+app.add_typer(objects.app, name="objects")
 
 
 @app.command()

@@ -29,7 +29,8 @@ def fit_presence(model: OpenWorld, banks: Mapping[int, Bank], tables: TableCrops
     for table in range(len(tables.rgb)):
         here = np.flatnonzero(tables.sights.table == table)
         chosen = _drawn(np.array(sorted(banks)), tables.sights.object[here], rng)
-        some = OpenWorld(model.proposer, model.encoder, model.comparison, [banks[n] for n in chosen], model.log_odds)
+        some = OpenWorld(model.proposer, model.encoder, model.comparison, [banks[n] for n in chosen], model.cohort,
+                         model.log_odds)
         for thing in _likeness(some, tables.rgb[table].cpu().numpy(), circles[here], tables.sights.object[here]):
             if thing is not None:
                 alike.append(thing[0])
@@ -50,8 +51,11 @@ def _likeness(model: OpenWorld, rgb: NDArray[np.uint8], circles: NDArray[np.floa
               objects: NDArray[np.int64]) -> list[tuple[Tensor, Tensor, int] | None]:
     """For each thing in an image its similarities to the objects of the model [K], the logits of the comparisons [K],
     and which object it shows (-1: none that is known); None where that cannot be said."""
-    things, similar = model.rolled_things(model.things(rgb, INTRINSICS, UP))
     told: list[tuple[Tensor, Tensor, int] | None] = []
+    things = model.things(rgb, INTRINSICS, UP)
+    if not len(things.crops):
+        return told
+    things, similar = model.rolled_things(things)
     for n in range(len(things.crops)):
         view = [int(each[n].argmax()) for each in similar]
         known = torch.stack([model.view(k, v) for k, v in enumerate(view)])
@@ -74,7 +78,7 @@ def _likeness(model: OpenWorld, rgb: NDArray[np.uint8], circles: NDArray[np.floa
 def fitted(alike: Tensor, same: Tensor, label: Tensor) -> LogOdds:
     """The coefficients that make these labels [T] (from 0 to K; K: none of the objects) likeliest, where things have
     these similarities and logits [T, K]."""
-    free = torch.tensor([20.0, 0.5, 14.0], dtype=torch.float64, requires_grad=True)
+    free = torch.tensor([20.0, 0.5, 3.0], dtype=torch.float64, requires_grad=True)
     start = free.detach().clone()
     optimizer = torch.optim.LBFGS([free], max_iter=100, line_search_fn="strong_wolfe")
 

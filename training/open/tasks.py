@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from saccade.services.perception.comparer import Comparison
-from saccade.services.perception.open_world import LogOdds, OpenWorld
+from saccade.services.perception.open_world import Cohort, LogOdds, OpenWorld
 from saccade.services.perception.proposer import Proposer
 from saccade.services.perception.view_encoder import ViewEncoder
 from saccade.shared.model.weights import Weights
@@ -20,11 +20,15 @@ from saccade.shared.render.objects import load_mesh
 from saccade.training.checkpoints import finished
 from saccade.training.open.banks import bank_from, bank_of_tiles
 from saccade.training.open.comparer import ComparerTask
-from saccade.training.open.encoder import EncoderTask
+from saccade.training.open.composer import CropMaker
+from saccade.training.open.encoder import AT_A_TIME, EncoderTask
 from saccade.training.open.material import Objects, load_held_out, load_material
 from saccade.training.open.presence import fit_presence
 from saccade.training.open.proposer import ProposerTask
+from saccade.training.open.tiles import load_tiles
 from saccade.training.settings import TrainingConfig
+
+OF_EACH = 3  # views of each thing that nobody knows in the cohort
 
 
 def open_task(run_dir: Path, config: TrainingConfig, part: str,
@@ -40,9 +44,10 @@ def open_task(run_dir: Path, config: TrainingConfig, part: str,
     return ComparerTask(config, material, encoder, device)
 
 
-def log_odds_for(run_dir: Path, config: TrainingConfig, states: Mapping[str, Mapping[str, Tensor]]) -> LogOdds:
-    """How likely a thing is an object by the networks with these tensors, fitted on tables to evaluate on. Raises
-    SaccadeError if these, or a mesh, are missing or damaged."""
+def judged(run_dir: Path, config: TrainingConfig,
+           states: Mapping[str, Mapping[str, Tensor]]) -> tuple[Tensor, LogOdds]:
+    """What the networks with these tensors judge by: the cohort's vectors [N, D], and how likely a thing is an object,
+    fitted on tables to evaluate on. Raises SaccadeError if these, or a mesh, are missing or damaged."""
     networks: dict[str, Proposer | ViewEncoder | Comparison] = {
         "proposer": Proposer(), "encoder": ViewEncoder(), "comparer": Comparison()}
     for part, network in networks.items():
@@ -54,7 +59,14 @@ def log_odds_for(run_dir: Path, config: TrainingConfig, states: Mapping[str, Map
     tables, objects = load_held_out(run_dir, config), Objects(config)
     banks = {number: bank_of_tiles(tiles, objects.mesh(tiles.name), encoder)
              for number, tiles in enumerate(tables.maker.tiles)}
-    return fit_presence(OpenWorld(proposer, encoder, comparison, []), banks, tables, np.random.default_rng(config.seed))
+    strangers = CropMaker(list(load_tiles(run_dir / "views", objects.made or objects.scanned)), torch.device("cpu"))
+    rng = np.random.default_rng([config.seed, 17])
+    which = np.repeat(np.arange(len(strangers.tiles)), OF_EACH)
+    with torch.inference_mode():
+        vectors = torch.cat([encoder(strangers.known(part, rng.integers(strangers.views[part])))
+                             for part in np.array_split(which, -(-len(which) // AT_A_TIME))])
+    model = OpenWorld(proposer, encoder, comparison, [], Cohort(vectors))
+    return vectors, fit_presence(model, banks, tables, np.random.default_rng(config.seed))
 
 
 def banks_for(config: TrainingConfig, networks: Path) -> dict[str, dict[str, NDArray[Any]]]:

@@ -1,0 +1,185 @@
+"""Objects of one's own: sets as folders, what is learnt of them, and that nothing of the others changes."""
+
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from saccade.app.objects.adding import add_meshes, learn_set, remove_objects
+from saccade.app.objects.learning import OPEN, likeness
+from saccade.app.objects.showing import list_set, show_object
+from saccade.app.objects.store import (
+    CARD,
+    TURNTABLE,
+    Card,
+    keep,
+    name_from,
+    obj_text,
+    own_folder,
+    require_free,
+)
+from saccade.shared.config import WEIGHTS, SceneConfig, learned_folder, set_folder
+from saccade.shared.errors import SaccadeError
+from saccade.shared.files import parse_toml
+from saccade.shared.model.bank import bank_of
+from saccade.shared.model.weights import Weights
+from saccade.shared.render.groceries import grocery
+from saccade.shared.render.mesh import read_obj
+from saccade.shared.render.objects import load_mesh, names_of
+
+
+@pytest.fixture
+def console():
+    from rich.console import Console
+
+    return Console(record=True, width=200)
+
+
+@pytest.fixture
+def home(tmp_path, monkeypatch):
+    monkeypatch.setenv("SACCADE_OBJECTS", str(tmp_path))
+    return tmp_path
+
+
+def mesh_of(number, name):
+    return grocery(np.random.default_rng([3, number]), name)
+
+
+def added(objects, *names):
+    for number, name in enumerate(names):
+        keep(own_folder(objects), mesh_of(number, name), Card(f"{name}.obj", "m", "z", ("It was made by code.",)))
+
+
+def test_a_set_is_named_or_its_folder_is_given(home):
+    added("my", "tea", "rice")
+    assert names_of("my") == ("rice", "tea")
+    assert names_of(str(home / "my")) == ("rice", "tea")
+    assert SceneConfig(objects=str(home / "other" / ".." / "my")).objects == str(home / "my")
+    assert set_folder("pantry") is None
+    assert learned_folder("ycb", "default") == WEIGHTS / "ycb"
+    assert learned_folder("my", OPEN) == home / "my" / "weights-open"
+    with pytest.raises(SaccadeError, match=r"object set 'none' is not there, or has no objects \(.*none\): choose"):
+        names_of("none")
+    with pytest.raises(SaccadeError, match="object 'oil' is not in 'my': choose from rice, tea"):
+        load_mesh("my", "oil")
+    with pytest.raises(SaccadeError, match="object set 'ycb' comes with Saccade and stays as it is"):
+        own_folder("ycb")
+
+
+def test_an_object_is_kept_as_it_was_with_its_card_and_its_picture(home):
+    added("my", "tea")
+    mesh, folder = mesh_of(0, "tea"), home / "my" / "tea"
+    again = read_obj(folder, "tea")
+    assert again.vertices_m[again.faces] == pytest.approx(mesh.vertices_m[mesh.faces], abs=2e-6)
+    assert again.texcoords[again.faces] == pytest.approx(mesh.texcoords[mesh.faces], abs=2e-6)
+    assert np.array_equal(again.texture, mesh.texture)
+    card = parse_toml((folder / CARD).read_text())
+    assert card["name"] == "tea"
+    assert card["size_m"] == pytest.approx(mesh.size_m, abs=1e-4)
+    assert card["notes"] == ["It was made by code."]
+    assert (folder / TURNTABLE).stat().st_size > 1000
+    assert [path.name for path in (home / "my").iterdir()] == ["tea"]  # nothing half done lies beside it
+
+
+@pytest.mark.parametrize(("path", "given", "name"), [
+    ("a/green tea (1).obj", None, "green_tea_1"), ("scans/milk/textured.obj", None, "milk"), ("x.glb", "cup", "cup")])
+def test_the_name_is_that_of_the_file_or_of_its_folder(tmp_path, path, given, name):
+    assert name_from(tmp_path / path, given) == name
+
+
+def test_a_name_that_no_object_can_have_or_that_is_taken_is_one_line(home, tmp_path):
+    with pytest.raises(SaccadeError, match="cannot be the name of an object: give one of at most 64 letters"):
+        name_from(tmp_path / "茶.obj", None)
+    added("my", "tea")
+    with pytest.raises(SaccadeError, match=r"object 'tea' is in .*my already: give another name"):
+        require_free(own_folder("my"), ["tea"])
+    with pytest.raises(SaccadeError, match="object 'oil' is given twice"):
+        require_free(own_folder("my"), ["oil", "oil"])
+
+
+def test_what_is_added_is_learnt_and_leaves_the_others_as_they_were(home, console):
+    added("my", "tea", "rice")
+    learn_set("my", console)
+    folder = learned_folder("my", OPEN)
+    before = {path.name: path.read_bytes() for path in folder.glob("*.safetensors")}
+    assert sorted(before) == ["rice.bank.safetensors", "tea.bank.safetensors"]
+    keep(own_folder("my"), mesh_of(7, "oil"), Card("oil.obj", "m", "z"))
+    learn_set("my", console)
+    after = {path.name: path.read_bytes() for path in folder.glob("*.safetensors")}
+    assert {name: after[name] for name in before} == before
+    weights = Weights(folder)
+    assert weights.names == ("rice", "tea", "oil")
+    assert weights.networks.folder == WEIGHTS / OPEN
+    assert len(bank_of("oil", weights.bank("oil")).pictures) > 100
+    assert (folder / "oil.bank.safetensors").stat().st_size < 600_000
+    names, alike = likeness("my")
+    assert np.diag(alike) == pytest.approx(1.0, abs=0.01)
+    assert alike[names.index("tea"), names.index("oil")] < 0.95
+    text = console.export_text()
+    assert "learnt rice, tea: 2 objects in" in text
+    assert "learnt oil: 3 objects in" in text
+
+
+def test_what_changed_is_learnt_again_and_what_is_removed_is_forgotten(home, console):
+    added("my", "tea", "rice")
+    learn_set("my", console)
+    folder = learned_folder("my", OPEN)
+    first = (folder / "tea.bank.safetensors").read_bytes()
+    shutil.rmtree(home / "my" / "tea")
+    keep(own_folder("my"), mesh_of(9, "tea"), Card("tea.obj", "m", "z"))
+    learn_set("my", console)
+    assert (folder / "tea.bank.safetensors").read_bytes() != first
+    remove_objects("my", ["tea"], console)
+    assert names_of("my") == ("rice",)
+    assert Weights(folder).names == ("rice",)
+    assert not (folder / "tea.bank.safetensors").exists()
+    with pytest.raises(SaccadeError, match=r"object 'tea' is not in .*my: it holds rice"):
+        remove_objects("my", ["tea"], console)
+
+
+def written(folder, number, name):
+    """A mesh in a file, as it comes from elsewhere."""
+    folder.mkdir()
+    mesh = mesh_of(number, name)
+    (folder / "textured.obj").write_text("mtllib m.mtl\nusemtl m\n" + obj_text(mesh))
+    (folder / "m.mtl").write_text("newmtl m\nmap_Kd label.png\n")
+    Image.fromarray(mesh.texture).save(folder / "label.png")
+    return folder / "textured.obj"
+
+
+def test_meshes_are_added_and_learnt_and_a_bad_one_does_not_stop_the_others(home, console, tmp_path, capsys):
+    good, bad = written(tmp_path / "tea", 0, "tea"), tmp_path / "flat.stl"
+    bad.write_text("solid\nendsolid\n")
+    with pytest.raises(SaccadeError, match="1 of 2 meshes are not added: see the lines above"):
+        add_meshes([bad, good], "my", name=None, unit="m", up="z", ask=None, console=console)
+    assert capsys.readouterr().err.startswith("saccade: ")
+    assert names_of("my") == ("tea",)
+    assert load_mesh("my", "tea").size_m == pytest.approx(mesh_of(0, "tea").size_m, abs=1e-4)
+    assert Weights(learned_folder("my", OPEN)).names == ("tea",)
+    text = console.export_text()
+    assert "its picture is" in text
+    assert "use it with `--agent open --objects my`" in text
+
+
+def test_who_says_no_adds_nothing(home, console, tmp_path):
+    asked = []
+    add_meshes([written(tmp_path / "tea", 0, "tea")], "my", name="cup", unit="m", up="z",
+               ask=lambda question: bool(asked.append(question)), console=console)
+    assert asked == ["Is cup right?"]
+    assert not (home / "my" / "cup").exists()
+    assert "cup is not added: --unit and --up say how the file is meant" in console.export_text()
+
+
+def test_a_set_is_listed_and_an_object_is_shown(home, console):
+    added("my", "tea", "rice")
+    list_set("my", console)
+    show_object("my", "tea", console)
+    learn_set("my", console)
+    show_object("my", "tea", console)
+    text = console.export_text()
+    assert text.count('source = "tea.obj"') == 2
+    assert "it is not learnt: `saccade objects learn`" in text
+    assert "most like it (1 is the same): rice" in text
+    with pytest.raises(SaccadeError, match=r"object 'oil' is not in 'my': it holds rice, tea"):
+        show_object("my", "oil", console)
