@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from saccade.app.objects.adding import add_meshes, learn_set, remove_objects
-from saccade.app.objects.learning import OPEN, likeness
+from saccade.app.objects.learning import likeness
 from saccade.app.objects.showing import list_set, show_object
 from saccade.app.objects.store import (
     CARD,
@@ -19,11 +19,11 @@ from saccade.app.objects.store import (
     own_folder,
     require_free,
 )
-from saccade.shared.config import WEIGHTS, SceneConfig, learned_folder, set_folder
+from saccade.shared.config import WEIGHTS, Config, SceneConfig, learned_folder, set_folder
 from saccade.shared.errors import SaccadeError
 from saccade.shared.files import parse_toml
 from saccade.shared.model.bank import bank_of
-from saccade.shared.model.weights import Weights
+from saccade.shared.model.weights import OPEN, Weights, weights_in_use
 from saccade.shared.render.groceries import grocery
 from saccade.shared.render.mesh import read_obj
 from saccade.shared.render.objects import load_mesh, names_of
@@ -65,6 +65,15 @@ def test_a_set_is_named_or_its_folder_is_given(home):
         load_mesh("my", "oil")
     with pytest.raises(SaccadeError, match="object set 'ycb' comes with Saccade and stays as it is"):
         own_folder("ycb")
+
+
+def test_an_agent_that_cannot_know_them_is_told_with_the_one_that_can(home):
+    added("my", "tea")
+    config = Config().with_values({"scene.objects": "my"})
+    with pytest.raises(SaccadeError, match=r"set 'my' is one of your own, .* add `--agent open`"):
+        weights_in_use(config)
+    with pytest.raises(SaccadeError, match=r"weights .*weights-open/manifest\.json are missing"):
+        weights_in_use(config.with_values({"perception.architecture": OPEN}))
 
 
 def test_an_object_is_kept_as_it_was_with_its_card_and_its_picture(home):

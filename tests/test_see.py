@@ -267,7 +267,7 @@ def test_pictures_are_written_over_no_photograph_and_no_other_picture(monkeypatc
     (("a.png", "--agent", "nobody"), "agent 'nobody' is unknown"),
     (("a.png", "--intrinsics", "1,2"), "write fx,fy,cx,cy"),
     (("a.png", "--intrinsics", "a,b,c,d"), "write fx,fy,cx,cy"),
-    (("a.png", "--objects", "fruit"), "--objects fruit: choose from pantry, ycb"),
+    (("a.png", "--objects", "fruit"), "object set 'fruit' is not there, or has no objects"),
     (("a.png", "--names", "teapot"), "'teapot' is not in 'pantry'"),
     (("a.png", "--weights", "none"), "none/manifest.json are missing"),
     (("a.png", "--json", "a.png"), "--json a.png is one of the photographs"),

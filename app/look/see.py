@@ -28,7 +28,7 @@ from saccade.shared.config import Config, load
 from saccade.shared.errors import LINE_LIMIT, SaccadeError, printable
 from saccade.shared.files import replace_whole, writing
 from saccade.shared.model.drawing import BankPictures, LatentDecoder, drawn
-from saccade.shared.model.weights import WITH_LATENTS, Weights
+from saccade.shared.model.weights import WITH_LATENTS, Weights, weights_in_use
 from saccade.shared.render.objects import names_in_use
 from saccade.shared.world.geometry import IMAGE_SIZE_PX, INTRINSICS_PX, REFERENCE_RANGE_M, pixel_rays, spherical
 from saccade.shared.world.photographs import Photograph, read_photograph
@@ -51,7 +51,7 @@ class Looker:
                                f"{', '.join(able)}")
         limit_torch()
         self.names = names_in_use(config.scene)
-        self.weights = Weights(config.weights)
+        self.weights = weights_in_use(config)
         self.model: Model = model_of(self.weights, self.names, config.perception.passes)
         self.square: bool = getattr(self.model, "square", True)  # whether the networks take square images only
         self._draw = {name: artist_of(self.weights, name) for name in self.names if draw}

@@ -44,7 +44,8 @@ def add_meshes(paths: Sequence[Path], objects: str, *, name: str | None, unit: L
         if ask is not None and not ask(f"Is {each} right?"):
             remove(folder, each)
             say(console, f"{each} is not added: --unit and --up say how the file is meant")
-    learn_set(objects, console)
+    if failed < len(paths):
+        learn_set(objects, console)
     if failed:
         raise SaccadeError(f"{failed} of {len(paths)} meshes are not added: see the lines above")
 

@@ -14,13 +14,12 @@ from saccade.services.perception.view_encoder import ViewEncoder
 from saccade.shared.config import WEIGHTS, learned_folder
 from saccade.shared.errors import SaccadeError
 from saccade.shared.log.provenance import commit
-from saccade.shared.model.weights import MANIFEST, ObjectCard, Weights, write_weights
+from saccade.shared.model.weights import MANIFEST, OPEN, ObjectCard, Weights, write_weights
 from saccade.shared.render.mesh import MESH_FILE
 from saccade.shared.render.objects import load_mesh, own_names
 from saccade.shared.render.views import crop_side_m
 from saccade.training.open.banks import bank_from
 
-OPEN = "open"  # architecture, and the folder of the networks that all objects share
 Arrays = dict[str, NDArray[Any]]
 
 

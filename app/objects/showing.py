@@ -6,12 +6,12 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from saccade.app.objects.learning import OPEN, likeness
+from saccade.app.objects.learning import likeness
 from saccade.app.objects.store import CARD, TURNTABLE
 from saccade.app.run.display import say
 from saccade.shared.config import learned_folder, set_folder
 from saccade.shared.errors import LINE_LIMIT, SaccadeError, printable, told
-from saccade.shared.model.weights import MANIFEST, Weights
+from saccade.shared.model.weights import MANIFEST, OPEN, Weights
 from saccade.shared.render.objects import load_mesh, names_of
 
 ALIKE = 5  # objects that are told to look most alike

@@ -123,11 +123,12 @@ def weight_hashes(agent: str, config: Config) -> dict[str, str]:
     """
     if not agent_of(agent).weights:
         return {}
-    from saccade.shared.model.weights import Weights
+    from saccade.shared.model.weights import weights_in_use
 
-    weights = Weights(config.weights)
+    weights = weights_in_use(config)
     weights.cards_of(config.scene.names or ())
-    return dict(sorted(weights.hashes.items()))
+    shared = weights.networks.hashes if "networks" in weights.manifest else {}
+    return dict(sorted(weights.hashes.items())) | {f"shared/{name}": shared[name] for name in sorted(shared)}
 
 
 def service_of(name: str, config: Config | None = None) -> Service:

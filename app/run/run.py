@@ -135,9 +135,9 @@ def require_weights(agent: str, config: Config) -> None:
     """Checks for the agent's weights before any process starts, without loading PyTorch. Raises SaccadeError if they
     are missing."""
     if agent_of(agent).weights and not (config.weights / MANIFEST_NAME).is_file():
-        from saccade.shared.model.weights import Weights
+        from saccade.shared.model.weights import weights_in_use
 
-        Weights(config.weights)
+        weights_in_use(config)
 
 
 def run_here(config: Config, agent: str, folder: Path, display: Display, world: str, lacks: list[str]) -> list[Result]:

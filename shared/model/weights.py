@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
-from saccade.shared.config import WEIGHTS
+from saccade.shared.config import WEIGHTS, Config, set_folder
 from saccade.shared.errors import SaccadeError, is_text, told
 from saccade.shared.files import MIB, parse_json, read_bytes, read_text, replace_all, writing
 
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from torch import nn
 
 Architecture = Literal["default", "paper", "posecnn", "lexa", "open"]
+OPEN = "open"  # architecture that needs no training for an object
 WITH_LATENTS = ("default", "paper")  # architectures with a CCN for each object
 
 MANIFEST = "manifest.json"
@@ -187,6 +188,15 @@ def _file_name(name: str) -> str:
     if not name or len(name) > MAX_NAME or not is_text(name) or "/" in name or "\\" in name:
         raise ValueError(f"{told(name)} cannot be the name of a file")
     return name
+
+
+def weights_in_use(config: Config) -> Weights:
+    """The weights that a configuration names. Raises SaccadeError if they are missing or damaged."""
+    own = set_folder(config.scene.objects) is not None and config.perception.weights is None
+    if own and config.perception.architecture != OPEN and not (config.weights / MANIFEST).is_file():
+        raise SaccadeError(f"object set {told(config.scene.objects)} is one of your own, and this agent's networks know "
+                           "none such: add `--agent open`")
+    return Weights(config.weights)
 
 
 def write_weights(folder: Path, states: Mapping[str, Mapping[str, ArrayLike]], cards: tuple[ObjectCard, ...],
