@@ -194,8 +194,8 @@ def weights_in_use(config: Config) -> Weights:
     """The weights that a configuration names. Raises SaccadeError if they are missing or damaged."""
     own = set_folder(config.scene.objects) is not None and config.perception.weights is None
     if own and config.perception.architecture != OPEN and not (config.weights / MANIFEST).is_file():
-        raise SaccadeError(f"object set {told(config.scene.objects)} is one of your own, and this agent's networks know "
-                           "none such: add `--agent open`")
+        raise SaccadeError(f"object set {told(config.scene.objects)} is one of your own, and this agent's networks "
+                           "know none such: add `--agent open`")
     return Weights(config.weights)
 
 
