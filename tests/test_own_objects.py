@@ -1,13 +1,16 @@
 """Objects of one's own: sets as folders, what is learnt of them, and that nothing of the others changes."""
 
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from saccade.app.cli.texts import configured
 from saccade.app.objects.adding import add_meshes, learn_set, remove_objects
 from saccade.app.objects.learning import likeness
+from saccade.app.objects.lists import assembled, is_list, members_of
 from saccade.app.objects.showing import list_set, show_object
 from saccade.app.objects.store import (
     CARD,
@@ -192,3 +195,42 @@ def test_a_set_is_listed_and_an_object_is_shown(home, console):
     assert "most like it (1 is the same): rice" in text
     with pytest.raises(SaccadeError, match=r"object 'oil' is not in 'my': it holds rice, tea"):
         show_object("my", "oil", console)
+
+
+# --- objects of several sets
+
+def test_listed_objects_of_several_sets_are_one_set(home, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    added("my", "tea", "rice")
+    added("other", "oil")
+    folder = assembled("tea,other,pantry:soup_can", OPEN)
+    assert names_of(folder) == ("oil", "soup_can", "tea")
+    for object_set, name in (("my", "tea"), ("other", "oil"), ("pantry", "soup_can")):
+        assert load_mesh(folder, name).size_m == pytest.approx(load_mesh(object_set, name).size_m, abs=1e-5)
+    weights = Weights(learned_folder(folder, OPEN))
+    assert sorted(weights.names) == ["oil", "soup_can", "tea"]
+    before = {path.name: path.stat().st_mtime_ns for path in Path(folder).iterdir()}
+    assert assembled("pantry:soup_can, tea,other:oil", OPEN) == folder
+    assert {path.name: path.stat().st_mtime_ns for path in Path(folder).iterdir()}.items() >= {
+        name: when for name, when in before.items() if not name.startswith("weights")}.items()
+    config = configured(None, {"scene.objects": "tea,oil"}, None, "still")
+    assert names_of(config.scene.objects) == ("oil", "tea")
+
+
+@pytest.mark.parametrize(("objects", "words"), [
+    ("tea,oil", "object 'oil' is in none of the sets my, other, pantry, ycb"),
+    ("rice,tea", "object 'rice' is in my and in other: write my:rice"),
+    ("my:rice,other:rice", "object 'rice' is listed twice"),
+    ("my:oil", "object 'oil' is not in 'my': choose from rice, tea"),
+    ("none:oil", "object set 'none' is not there"), (",", "lists nothing: write NAME,SET:NAME,SET")])
+def test_a_list_that_cannot_be_is_one_line(home, objects, words):
+    added("my", "tea", "rice")
+    added("other", "rice")
+    with pytest.raises(SaccadeError, match=words):
+        members_of(objects)
+
+
+def test_a_folder_with_a_colon_is_no_list(tmp_path):
+    assert not is_list(str(tmp_path / "a:b"))
+    assert is_list("pantry:soup_can")
+    assert not is_list("my")

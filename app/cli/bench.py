@@ -52,7 +52,7 @@ def bench(*, objects: Objects = None, scenes: ScenesFile = None,
         raise SaccadeError("--yaw is for scenes that are drawn: leave it or --scenes and --suite out")
     if yaw is not None:
         suite = {"fixed": "paper-like", "random": "paper-like-yaw"}[yaw]
-    name = "_".join(filter(None, (agent, resolved.scene.objects, suite)))
+    name = "_".join(filter(None, (agent, Path(resolved.scene.objects).name, suite)))
     plan = prepare(agent, resolved, json or Path("bench") / f"{name}.json", suite=suite, limit=limit)
     run_bench(plan, jobs=jobs, cluster=cluster, command=command_line(), console=wide(Console()))
 

@@ -13,7 +13,8 @@ import typer
 AGENTS = ("sceneccn (Saccade's own), paper, open, posecnn, posecnn-infogain, render-and-compare, lexa, random-walk, "
           "still, or oracle (which knows the goal's pose)")
 Objects = Annotated[str | None, typer.Option(
-    help="Object set: pantry, ycb, one of your own, or the folder of one.", metavar="SET", show_default="pantry")]
+    help="Object set: pantry, ycb, one of your own, or the folder of one; or a list such as milk,pantry:soup_can.",
+    metavar="SET", show_default="pantry")]
 Names = Annotated[str | None, typer.Option(help="Use only these objects of the set, such as a,b.", metavar="NAMES")]
 ConfigFile = Annotated[Path | None, typer.Option(
     help="Configuration file, TOML or JSON, or the name of a preset. Options take precedence over it.")]

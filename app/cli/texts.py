@@ -17,7 +17,14 @@ def configured(path: Path | None, given: dict[str, Any], values: list[str] | Non
     from saccade.shared.config import load
 
     options = {key: value for key, value in given.items() if value is not None}
-    return load(path, agent_of(agent).preset).with_values(options | dict(map(parse_value, values or ())))
+    config = load(path, agent_of(agent).preset).with_values(options | dict(map(parse_value, values or ())))
+    if "," in config.scene.objects or ":" in config.scene.objects:
+        from saccade.app.objects.lists import assembled, is_list
+
+        if is_list(config.scene.objects):
+            folder = assembled(config.scene.objects, config.perception.architecture)
+            return config.with_values({"scene.objects": folder})
+    return config
 
 
 def parse_value(text: str) -> tuple[str, Any]:
