@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from saccade.services.perception.open_world import LogOdds, turned
+from saccade.services.perception.likeness import LogOdds
+from saccade.services.perception.open_world import turned
 from saccade.services.perception.view_encoder import ViewEncoder
 from saccade.shared.errors import SaccadeError
 from saccade.shared.render.groceries import grocery

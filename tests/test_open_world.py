@@ -8,7 +8,8 @@ import torch
 import torch.nn.functional as F
 
 from saccade.services.perception.comparer import Compared, Comparison
-from saccade.services.perception.open_world import UNIT, Cohort, Match, OpenWorld, Placed, Things, rolled
+from saccade.services.perception.likeness import UNIT, Cohort
+from saccade.services.perception.open_world import Match, OpenWorld, Placed, Things, rolled
 from saccade.services.perception.proposer import STRIDE, Proposer, places, propose
 from saccade.services.perception.view_encoder import VECTOR, ViewEncoder
 from saccade.shared.model.bank import FILLED, Bank, bank_of, compressed

@@ -15,7 +15,7 @@ import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
-from saccade.services.perception.open_world import COHORT
+from saccade.services.perception.likeness import COHORT
 from saccade.services.perception.paper import CROP_SIDE_M
 from saccade.shared.errors import SaccadeError
 from saccade.shared.files import replace_whole, writing

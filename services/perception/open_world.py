@@ -17,6 +17,7 @@ from torch import Tensor
 
 from saccade.services.perception.comparer import Compared, Comparison
 from saccade.services.perception.cropping import Cropper
+from saccade.services.perception.likeness import COHORT, USUAL, Cohort, LogOdds
 from saccade.services.perception.proposer import Proposals, Proposer, half_tangent, propose
 from saccade.services.perception.seen import Modes, Seen, bits
 from saccade.services.perception.view_encoder import ViewEncoder
@@ -35,8 +36,6 @@ CAP_RAD = 0.35  # views within this of a compared one are told as one, where the
 VIEW_STD_RAD = 0.12  # of a direction that is told by a view alone: about half of the way to the next one
 MASK_PX = 60
 SHARPNESS = 20.0  # of the similarities, where it is told how an object is turned
-COHORT, LIKEST = "cohort", 50  # name of the cohort's file, and how many of its views count
-UNIT = 0.05  # about the standard deviation of the largest similarities, so that normalised ones are as large as others
 ROLLS_RAD = 2 * np.pi / 8 * np.arange(8)  # in which a thing is tried that is like nothing as it stands
 
 Array = NDArray[np.float64]
@@ -62,42 +61,6 @@ def open_world_of(weights: Weights, names: tuple[str, ...]) -> OpenWorld:
     fitted = {key: value for key, value in shared.calibration.items() if key in LogOdds.__annotations__}
     cohort = Cohort(torch.from_numpy(shared.state(COHORT)["vectors"]))
     return OpenWorld(proposer, encoder, comparison, banks, cohort, LogOdds(**fitted))
-
-
-@dataclass(frozen=True)
-class LogOdds:
-    """The log odds that a thing is an object, against its being none that is known: `similar` times the similarity to
-    the object's view, and `compared` times the logit of the comparison, less `none`."""
-
-    similar: float = 20.0
-    compared: float = 0.3
-    none: float = 3.0
-
-    def __call__(self, similar: Tensor, same: Tensor | float = 0.0) -> Tensor:
-        return self.similar * similar + self.compared * same - self.none
-
-
-class Cohort:
-    """Views of things that nobody knows, as unit vectors [N, D]: what a similarity is worth shows beside those to them.
-
-    A crop that is blurred is less like everything, and a plain box is like many things. So each similarity is measured
-    from the mean of the largest ones that the crop, and that the known view, have with the cohort, in units of their
-    standard deviation, and the two are averaged (symmetric score normalisation, Matejka et al., Interspeech 2017).
-    """
-
-    def __init__(self, vectors: Tensor) -> None:
-        self.vectors = vectors
-
-    def likest(self, vectors: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and standard deviation [P, 1] of the largest similarities of vectors [P, D] to the cohort."""
-        largest = (vectors @ self.vectors.T).topk(min(LIKEST, len(self.vectors)), dim=1).values
-        return largest.mean(1, keepdim=True), largest.std(1, keepdim=True).clamp(min=1e-3)
-
-    def normalised(self, similar: Tensor, crops: tuple[Tensor, Tensor], views: tuple[Tensor, Tensor]) -> Tensor:
-        """Similarities [P, V], normalised; `crops` [P, 1] and `views` [V, 1] are what `likest` says of both."""
-        by_crop = (similar - crops[0]) / crops[1]
-        by_view = (similar - views[0].T) / views[1].T
-        return UNIT * (by_crop + by_view) / 2
 
 
 @dataclass(frozen=True)
@@ -128,7 +91,7 @@ class OpenWorld:
     square = False  # an image may have any sides
 
     def __init__(self, proposer: Proposer, encoder: ViewEncoder, comparison: Comparison, banks: list[Bank],
-                 cohort: Cohort, log_odds: LogOdds = LogOdds()):
+                 cohort: Cohort, log_odds: LogOdds = USUAL):
         self.proposer, self.encoder, self.comparison = proposer.eval(), encoder.eval(), comparison.eval()
         self.banks, self.log_odds = banks, log_odds
         self.vectors = [torch.from_numpy(bank.vectors) for bank in banks]

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from saccade.services.perception.comparer import Compared
-from saccade.services.perception.open_world import LogOdds, OpenWorld
+from saccade.services.perception.likeness import LogOdds
+from saccade.services.perception.open_world import OpenWorld
 from saccade.shared.model.bank import FILLED, Bank
 from saccade.training.open.proposer import circles_px
 from saccade.training.open.table_crops import INTRINSICS, TableCrops

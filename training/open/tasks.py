@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from saccade.services.perception.comparer import Comparison
-from saccade.services.perception.open_world import Cohort, LogOdds, OpenWorld
+from saccade.services.perception.likeness import Cohort, LogOdds
+from saccade.services.perception.open_world import OpenWorld
 from saccade.services.perception.proposer import Proposer
 from saccade.services.perception.view_encoder import ViewEncoder
 from saccade.shared.model.weights import Weights
