@@ -67,14 +67,14 @@ class BusConfig(Section):
 def sets_folder() -> Path:
     """Where the user's own object sets lie: SACCADE_OBJECTS if it is set, otherwise a folder of the user's data."""
     data = Path(os.environ.get("XDG_DATA_HOME", Path.home() / ".local" / "share"))
-    return Path(os.environ.get("SACCADE_OBJECTS", data / "saccade" / "objects"))
+    return Path(os.environ.get("SACCADE_OBJECTS") or data / "saccade" / "objects")
 
 
 def set_folder(objects: str) -> Path | None:
     """The folder of an object set of the user's. None if the set is built in."""
     if objects in BUILT_IN_SETS:
         return None
-    return Path(objects) if _is_path(objects) else sets_folder() / objects
+    return Path(objects).expanduser().resolve() if _is_path(objects) else sets_folder() / objects
 
 
 def learned_folder(objects: str, architecture: str) -> Path:

@@ -1,5 +1,6 @@
 """Objects of one's own: sets as folders, what is learnt of them, and that nothing of the others changes."""
 
+import json
 import shutil
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from saccade.app.objects.store import (
     CARD,
     TURNTABLE,
     Card,
+    alone_in,
     keep,
     name_from,
     obj_text,
@@ -26,7 +28,7 @@ from saccade.shared.config import WEIGHTS, Config, SceneConfig, learned_folder, 
 from saccade.shared.errors import SaccadeError
 from saccade.shared.files import parse_toml
 from saccade.shared.model.bank import bank_of
-from saccade.shared.model.weights import OPEN, Weights, weights_in_use
+from saccade.shared.model.weights import MANIFEST, OPEN, Weights, weights_in_use
 from saccade.shared.render.groceries import grocery
 from saccade.shared.render.mesh import read_obj
 from saccade.shared.render.objects import load_mesh, names_of
@@ -70,13 +72,23 @@ def test_a_set_is_named_or_its_folder_is_given(home):
         own_folder("ycb")
 
 
-def test_an_agent_that_cannot_know_them_is_told_with_the_one_that_can(home):
+def test_who_uses_what_is_not_learnt_is_told_what_to_do(home, console):
     added("my", "tea")
     config = Config().with_values({"scene.objects": "my"})
     with pytest.raises(SaccadeError, match=r"set 'my' is one of your own, .* add `--agent open`"):
         weights_in_use(config)
-    with pytest.raises(SaccadeError, match=r"weights .*weights-open/manifest\.json are missing"):
-        weights_in_use(config.with_values({"perception.architecture": OPEN}))
+    config = config.with_values({"perception.architecture": OPEN})
+    with pytest.raises(SaccadeError, match="set 'my' is not learnt: `saccade objects learn --set my`"):
+        weights_in_use(config)
+    learn_set("my", console)
+    assert weights_in_use(config.with_values({"scene.names": ["tea"]})).names == ("tea",)
+    added("my", "rice")
+    with pytest.raises(SaccadeError, match="object 'rice' of the set 'my' is not learnt: `saccade objects learn"):
+        weights_in_use(config.with_values({"scene.names": ["tea", "rice"]}))
+    manifest = learned_folder("my", OPEN) / MANIFEST
+    manifest.write_text(manifest.read_text().replace('"networks_sha256": "', '"networks_sha256": "0'))
+    with pytest.raises(SaccadeError, match="was learnt with other networks than these"):
+        weights_in_use(config.with_values({"scene.names": ["tea"]}))
 
 
 def test_an_object_is_kept_as_it_was_with_its_card_and_its_picture(home):
@@ -106,7 +118,7 @@ def test_a_name_that_no_object_can_have_or_that_is_taken_is_one_line(home, tmp_p
     added("my", "tea")
     with pytest.raises(SaccadeError, match=r"object 'tea' is in .*my already: give another name"):
         require_free(own_folder("my"), ["tea"])
-    with pytest.raises(SaccadeError, match="object 'oil' is given twice"):
+    with pytest.raises(SaccadeError, match="two of the meshes have the name 'oil'"):
         require_free(own_folder("my"), ["oil", "oil"])
 
 
@@ -163,7 +175,7 @@ def written(folder, number, name):
 def test_meshes_are_added_and_learnt_and_a_bad_one_does_not_stop_the_others(home, console, tmp_path, capsys):
     good, bad = written(tmp_path / "tea", 0, "tea"), tmp_path / "flat.stl"
     bad.write_text("solid\nendsolid\n")
-    with pytest.raises(SaccadeError, match="1 of 2 meshes are not added: see the lines above"):
+    with pytest.raises(SaccadeError, match="1 of 2 meshes could not be added: see above"):
         add_meshes([bad, good], "my", name=None, unit="m", up="z", ask=None, console=console)
     assert capsys.readouterr().err.startswith("saccade: ")
     assert names_of("my") == ("tea",)
@@ -172,6 +184,49 @@ def test_meshes_are_added_and_learnt_and_a_bad_one_does_not_stop_the_others(home
     text = console.export_text()
     assert "its picture is" in text
     assert "use it with `--agent open --objects my`" in text
+
+
+@pytest.mark.parametrize("damage", ["bank", "manifest", "hashes", "gone"])
+def test_what_was_learnt_and_is_damaged_is_learnt_again(home, console, damage):
+    added("my", "tea", "rice")
+    learn_set("my", console)
+    folder = learned_folder("my", OPEN)
+    right = {path.name: path.read_bytes() for path in folder.glob("*.safetensors")}
+    if damage == "bank":
+        (folder / "tea.bank.safetensors").write_bytes(b"no bank")
+    elif damage == "gone":
+        (folder / "tea.bank.safetensors").unlink()
+    elif damage == "manifest":
+        (folder / MANIFEST).write_text("{")
+    else:
+        told = json.loads((folder / MANIFEST).read_text()) | {"meshes_sha256": ["x"]}
+        (folder / MANIFEST).write_text(json.dumps(told))
+    learn_set("my", console)
+    assert {path.name: path.read_bytes() for path in folder.glob("*.safetensors")} == right
+    assert sorted(Weights(folder).names) == ["rice", "tea"]
+
+
+def test_an_object_that_cannot_be_learnt_does_not_stop_the_others(home, console, capsys):
+    added("my", "tea", "rice", "oil")
+    text = (home / "my" / "rice" / "textured.obj").read_text()
+    (home / "my" / "rice" / "textured.obj").write_text(text.replace("v 0", "v 90").replace("v -0", "v -90"))
+    (home / "my" / "oil" / "textured.obj").write_text("no mesh")
+    with pytest.raises(SaccadeError, match="2 of the set's objects could not be learnt: see above"):
+        learn_set("my", console)
+    assert Weights(learned_folder("my", OPEN)).names == ("tea",)
+    told = capsys.readouterr().err
+    assert "object 'rice' is " in told
+    assert "or remove it with `saccade objects remove oil`" in told
+    list_set("my", console)
+    assert "damaged: mesh" in console.export_text()
+
+
+def test_only_one_command_changes_a_set_at_a_time(home, console):
+    added("my", "tea")
+    (home / "my" / ".adding-left").mkdir()
+    with alone_in(home / "my"), pytest.raises(SaccadeError, match=r"changes the object set .*my: wait"):
+        learn_set("my", console)
+    assert not (home / "my" / ".adding-left").exists()
 
 
 def test_who_says_no_adds_nothing(home, console, tmp_path):
@@ -191,7 +246,7 @@ def test_a_set_is_listed_and_an_object_is_shown(home, console):
     show_object("my", "tea", console)
     text = console.export_text()
     assert text.count('source = "tea.obj"') == 2
-    assert "it is not learnt: `saccade objects learn`" in text
+    assert "learnt: no; `saccade objects learn` does it" in text
     assert "most like it (1 is the same): rice" in text
     with pytest.raises(SaccadeError, match=r"object 'oil' is not in 'my': it holds rice, tea"):
         show_object("my", "oil", console)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import typer
 
@@ -27,6 +28,8 @@ def add(meshes: Annotated[list[Path], typer.Argument(metavar="MESH...", help="OB
     from saccade.app.objects.adding import add_meshes
     from saccade.shared.errors import SaccadeError
 
+    if not yes and not sys.stdin.isatty():
+        raise SaccadeError("nobody can be asked without a terminal whether an object is right: add --yes")
     if name is not None and len(meshes) > 1:
         raise SaccadeError("--name is for one mesh: add the others without it, or one by one")
     add_meshes(meshes, objects, name=name, unit=unit, up=up, ask=None if yes else _ask, console=Console())
@@ -73,5 +76,10 @@ def remove(names: Annotated[list[str], typer.Argument(metavar="NAME...", help="O
     remove_objects(objects, names, Console())
 
 
-def _ask(question: str) -> Any:
-    return typer.confirm(question, default=True)
+def _ask(question: str) -> bool:
+    from saccade.shared.errors import SaccadeError
+
+    try:
+        return typer.confirm(question, default=True)
+    except typer.Abort as error:
+        raise SaccadeError("stopped at the question: this object is not added") from error

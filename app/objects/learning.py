@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import shutil
 from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,76 +16,119 @@ from numpy.typing import NDArray
 from saccade.services.perception.view_encoder import ViewEncoder
 from saccade.shared.config import WEIGHTS, learned_folder
 from saccade.shared.errors import SaccadeError
+from saccade.shared.files import read_bytes
 from saccade.shared.log.provenance import commit
-from saccade.shared.model.weights import MANIFEST, OPEN, ObjectCard, Weights, write_weights
-from saccade.shared.render.mesh import MESH_FILE
+from saccade.shared.model.weights import OPEN, ObjectCard, Weights, write_weights
+from saccade.shared.render.mesh import MAX_FILE_BYTES, MESH_FILE
 from saccade.shared.render.objects import load_mesh, own_names
 from saccade.shared.render.views import crop_side_m
 from saccade.training.open.banks import bank_from
 
 Arrays = dict[str, NDArray[Any]]
+SIZES_M = (0.002, 5.0)  # the largest side of an object
 
 
-def learn(objects: str, folder: Path, show: Callable[[str, int, int], None]) -> list[str]:
-    """Makes the banks that are missing or out of date in a set, and forgets those of objects that are gone.
+@dataclass(frozen=True)
+class Learnt:
+    """The names of the objects that were learnt, and a line for each one that could not be."""
 
-    What is done is kept when this is interrupted. Returns the names of the objects that were learnt. `show` is told
-    (object, how many are done, how many there are). Raises SaccadeError if a mesh or the networks are damaged.
+    names: list[str]
+    refused: list[str]
+
+
+def learn(objects: str, folder: Path, show: Callable[[str, int, int], None]) -> Learnt:
+    """Makes the banks that are missing, damaged or out of date in a set, and forgets those of objects that are gone.
+
+    What is done is kept when this is interrupted. `show` is told (object, how many are done, how many there are).
+    Raises SaccadeError if the networks are damaged, or if the banks cannot be written.
     """
     networks, target = Weights(WEIGHTS / OPEN), learned_folder(objects, OPEN)
-    digests = {name: _digest(folder / name) for name in own_names(folder)}
-    basis = hashlib.sha256("".join(sorted(networks.hashes.values())).encode()).hexdigest()
-    cards, banks = _known(target, basis, digests)
+    names, refused = own_names(folder), list[str]()
+    digests: dict[str, str] = {}
+    for name in names:
+        try:
+            digests[name] = digest(folder / name)
+        except SaccadeError as error:
+            refused.append(str(error))
+    cards, banks, is_whole = _known(target, networks.basis, digests)
     missing = [name for name in digests if name not in banks]
     encoder = networks.fill(ViewEncoder(), "encoder")
     assert isinstance(encoder, ViewEncoder)  # it is what was filled
-
-    def save() -> None:
-        facts = {"architecture": OPEN, "networks": OPEN, "networks_sha256": basis, "commit": commit(),
-                 "meshes_sha256": {name: digests[name] for name in cards}}
-        write_weights(target, {}, tuple(cards.values()), facts, banks)
-
+    learnt = list[str]()
     for done, name in enumerate(missing):
         show(name, done, len(missing))
-        mesh = load_mesh(objects, name)
+        try:
+            mesh = load_mesh(objects, name)
+            require_size(mesh.size_m, name)
+        except SaccadeError as error:
+            refused.append(f"{error}; or remove it with `saccade objects remove {name}`")
+            continue
         banks[name] = bank_from(mesh, encoder).arrays()
         cards[name] = ObjectCard(name, mesh.size_m, crop_side_m(mesh.size_m))
-        save()
+        _write(target, networks.basis, digests, cards, banks)
+        learnt.append(name)
         show(name, done + 1, len(missing))
-    if not missing:
-        save()
-    _forget(target, digests)
-    return missing
+    if not learnt and not is_whole and cards:
+        _write(target, networks.basis, digests, cards, banks)
+    _forget(target, cards)
+    return Learnt(learnt, refused)
 
 
-def _known(target: Path, basis: str, digests: dict[str, str]) -> tuple[dict[str, ObjectCard], dict[str, Arrays]]:
-    """The cards and banks that are still right."""
-    if not (target / MANIFEST).is_file():
-        return {}, {}
-    weights = Weights(target)
-    told = weights.manifest
-    if told.get("networks_sha256") != basis:
-        return {}, {}
-    before = told.get("meshes_sha256", {})
-    same = [card for card in weights.cards if before.get(card.name) == digests.get(card.name, "")]
-    return {card.name: card for card in same}, {card.name: weights.bank(card.name) for card in same}
+def require_size(size_m: NDArray[np.float64], name: str) -> None:
+    """Raises SaccadeError if an object is far too small or too large."""
+    largest = float(np.max(size_m))
+    if not SIZES_M[0] <= largest <= SIZES_M[1]:
+        raise SaccadeError(f"object {name!r} is {largest:g} m large, and one of {SIZES_M[0]:g} to {SIZES_M[1]:g} m can "
+                           "be learnt: mend its mesh")
 
 
-def _forget(target: Path, digests: dict[str, str]) -> None:
-    """Removes the files of banks whose objects are gone."""
+def _write(target: Path, basis: str, digests: dict[str, str], cards: dict[str, ObjectCard],
+           banks: dict[str, Arrays]) -> None:
+    facts = {"architecture": OPEN, "networks": OPEN, "networks_sha256": basis, "commit": commit(),
+             "meshes_sha256": {name: digests[name] for name in cards}}
+    write_weights(target, {}, tuple(cards.values()), facts, banks)
+
+
+def _known(target: Path, basis: str,
+           digests: dict[str, str]) -> tuple[dict[str, ObjectCard], dict[str, Arrays], bool]:
+    """The cards and banks that are still right, and whether these are all that there are."""
+    cards: dict[str, ObjectCard] = {}
+    banks: dict[str, Arrays] = {}
+    try:
+        weights = Weights(target)
+    except SaccadeError:  # there are none, or they are damaged: they are made again
+        return cards, banks, False
+    before = digests_of(weights) if weights.manifest.get("networks_sha256") == basis else {}
+    for card in weights.cards:
+        if before.get(card.name) == digests.get(card.name, ""):
+            with suppress(SaccadeError):
+                banks[card.name] = weights.bank(card.name)
+                cards[card.name] = card
+    return cards, banks, len(cards) == len(weights.cards)
+
+
+def digests_of(weights: Weights) -> dict[str, str]:
+    """The hashes of the meshes from which banks were made, by object."""
+    found = weights.manifest.get("meshes_sha256")
+    return found if isinstance(found, dict) else {}
+
+
+def _forget(target: Path, cards: dict[str, ObjectCard]) -> None:
+    """Removes the files of banks whose objects are gone, and all if none is left."""
+    if not cards:
+        shutil.rmtree(target, ignore_errors=True)
     for path in target.glob("*.bank.safetensors"):
-        if path.name.removesuffix(".bank.safetensors") not in digests:
+        if path.name.removesuffix(".bank.safetensors") not in cards:
             path.unlink()
 
 
-def _digest(folder: Path) -> str:
+def digest(folder: Path) -> str:
     """The hash of an object's mesh and texture. Raises SaccadeError if they cannot be read."""
-    found = hashlib.sha256()
-    try:
-        for path in sorted((folder / MESH_FILE, *folder.glob("texture_map.*"))):
-            found.update(path.read_bytes())
-    except OSError as error:
-        raise SaccadeError(f"object {folder} cannot be read ({error.strerror}): remove it, and add it again") from error
+    found, need = hashlib.sha256(), "mend it, or remove the object and add it again"
+    paths = [folder / MESH_FILE, *(path for ending in ("png", "jpg", "jpeg")
+                                   if (path := folder / f"texture_map.{ending}").is_file())]
+    for path in paths:
+        found.update(read_bytes(path, "mesh", need, MAX_FILE_BYTES))
     return found.hexdigest()
 
 

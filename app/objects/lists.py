@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 
 from saccade.app.objects.learning import learn
-from saccade.app.objects.store import Card, keep
+from saccade.app.objects.store import Card, alone_in, keep
 from saccade.shared.config import BUILT_IN_SETS, set_folder, sets_folder
 from saccade.shared.errors import SaccadeError, told
 from saccade.shared.files import writing
@@ -45,7 +45,9 @@ def assembled(objects: str, architecture: str) -> str:
                 (folder / name).unlink(missing_ok=True)
                 (folder / name).symlink_to((where / name).resolve())
     if architecture == OPEN:
-        learn(str(folder), folder, lambda *_: None)
+        with alone_in(folder):
+            if refused := learn(str(folder), folder, lambda *_: None).refused:
+                raise SaccadeError(refused[0])
     return str(folder)
 
 

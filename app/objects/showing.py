@@ -6,12 +6,12 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from saccade.app.objects.learning import likeness
+from saccade.app.objects.learning import digest, digests_of, likeness
 from saccade.app.objects.store import CARD, TURNTABLE
 from saccade.app.run.display import say
 from saccade.shared.config import learned_folder, set_folder
 from saccade.shared.errors import LINE_LIMIT, SaccadeError, printable, told
-from saccade.shared.model.weights import MANIFEST, OPEN, Weights
+from saccade.shared.model.weights import OPEN, Weights
 from saccade.shared.render.objects import load_mesh, names_of
 
 ALIKE = 5  # objects that are told to look most alike
@@ -19,11 +19,13 @@ ALIKE = 5  # objects that are told to look most alike
 
 def list_set(objects: str, console: Console) -> None:
     """Prints the objects of a set: their sizes, and whether they are learnt. Raises SaccadeError if there are none."""
-    learnt = _learnt(objects)
     table = Table("object", "size (cm)", "faces", "learnt")
     for name in names_of(objects):
-        mesh = load_mesh(objects, name)
-        table.add_row(Text(name), _size(mesh.size_m), str(len(mesh.faces)), "yes" if name in learnt else "no")
+        try:
+            mesh = load_mesh(objects, name)
+            table.add_row(Text(name), _size(mesh.size_m), str(len(mesh.faces)), _learnt(objects, name))
+        except SaccadeError as error:
+            table.add_row(Text(name), "", "", Text(f"damaged: {printable(str(error), LINE_LIMIT)}"))
     console.print(table)
 
 
@@ -40,8 +42,8 @@ def show_object(objects: str, name: str, console: Console) -> None:
         say(console, f"its picture is {folder / name / TURNTABLE}")
     else:
         say(console, f"{name}: {_size(load_mesh(objects, name).size_m)} cm")
-    if name not in _learnt(objects):
-        say(console, "it is not learnt: `saccade objects learn`")
+    if (state := _learnt(objects, name)) != "yes":
+        say(console, f"learnt: {state}; `saccade objects learn` does it")
         return
     names, alike = likeness(objects)
     row = alike[names.index(name)]
@@ -51,9 +53,17 @@ def show_object(objects: str, name: str, console: Console) -> None:
         say(console, f"most like it (1 is the same): {said}")
 
 
-def _learnt(objects: str) -> tuple[str, ...]:
-    folder = learned_folder(objects, OPEN)
-    return Weights(folder).names if (folder / MANIFEST).is_file() else ()
+def _learnt(objects: str, name: str) -> str:
+    """Whether an object is learnt: "yes", "no", or "changed" if its mesh is another one since."""
+    folder, own = learned_folder(objects, OPEN), set_folder(objects)
+    try:
+        weights = Weights(folder)
+        weights.bank(name)
+    except (SaccadeError, KeyError):
+        return "no"
+    if own is not None and digests_of(weights).get(name) != digest(own / name):
+        return "changed"
+    return "yes"
 
 
 def _size(size_m) -> str:

@@ -7,8 +7,10 @@ import json
 import os
 import re
 import shutil
+import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,7 +27,11 @@ from saccade.shared.render.world import World
 from saccade.shared.wording import WORLD
 from saccade.shared.world.geometry import direction, look_at
 
+if sys.platform != "win32":
+    import fcntl
+
 CARD, TEXTURE, TURNTABLE = "object.toml", "texture_map.png", "turntable.png"
+RESERVED = "weights"  # what is learnt of a set lies in folders whose names begin so
 VIEWS, VIEW_PX = 8, 160  # of the picture of an object
 ELEVATION_RAD, HALF_ANGLE = 0.5, 0.35  # of its camera; the tangent of half the angle that the object covers
 
@@ -50,6 +56,8 @@ class Card:
 def own_folder(objects: str) -> Path:
     """The folder of a set of the user's. Raises SaccadeError if the set is built in, or if no set can be named so."""
     folder = set_folder(objects)
+    if not objects:
+        raise SaccadeError("--set is empty: give the name of a set of your own, or its folder")
     if folder is None:
         raise SaccadeError(f"object set {objects!r} comes with Saccade and stays as it is: name a set of your own")
     if not re.fullmatch(WORLD, folder.name):
@@ -62,23 +70,44 @@ def name_from(path: Path, given: str | None) -> str:
     generic = ("textured", "mesh", "model", "scene", "object", "untitled")
     stem = path.parent.name if path.stem.lower() in generic and path.parent.name else path.stem
     name = given if given is not None else re.sub(r"[^A-Za-z0-9_-]+", "_", stem).strip("_")[:64]
-    if not re.fullmatch(WORLD, name):
+    if not re.fullmatch(WORLD, name) or name.startswith(("-", RESERVED)):
         raise SaccadeError(f"{path}: {told(name)} cannot be the name of an object: give one of at most 64 letters, "
-                           "digits, - and _ with --name")
+                           f"digits, - and _ with --name, which does not begin with - or {RESERVED}")
     return name
 
 
 def require_free(folder: Path, names: Sequence[str]) -> None:
     """Raises SaccadeError if one of these names is used twice, or is in the set already."""
     for number, name in enumerate(names):
-        if name in names[:number] or (folder / name).exists():
-            where = "given twice" if name in names[:number] else f"in {folder} already"
-            raise SaccadeError(f"object {name!r} is {where}: give another name with --name, or remove it first with "
-                               f"`saccade objects remove {name}`")
+        if name in names[:number]:
+            raise SaccadeError(f"two of the meshes have the name {name!r}: add them one by one, with --name")
+        if (folder / name).exists():
+            raise SaccadeError(f"object {name!r} is in {folder} already: give another name with --name, or remove it "
+                               f"first with `saccade objects remove {name}`")
 
 
-def keep(folder: Path, mesh: Mesh, card: Card) -> Path:
-    """Puts an object into a set, at once or not at all. Returns its folder. Raises SaccadeError if this fails."""
+@contextmanager
+def alone_in(folder: Path) -> Iterator[None]:
+    """Only one command at a time changes a set. What an earlier one left half done is taken away. Raises SaccadeError
+    if another one is at work, or if the folder cannot be used."""
+    with writing(folder, "object set"):
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise SaccadeError(f"another command changes the object set {folder}: wait until it is done") from error
+        for left in (*folder.glob(".adding-*"), *folder.glob(".removed-*")):
+            shutil.rmtree(left, ignore_errors=True)
+        yield
+    finally:
+        os.close(lock)
+
+
+def keep(folder: Path, mesh: Mesh, card: Card, picture: NDArray[np.uint8] | None = None) -> Path:
+    """Puts an object into a set, at once or not at all; `picture` is that of `turntable`. Returns its folder. Raises
+    SaccadeError if this fails."""
     target = folder / mesh.name
     with writing(target, "object"):
         folder.mkdir(parents=True, exist_ok=True)
@@ -86,7 +115,7 @@ def keep(folder: Path, mesh: Mesh, card: Card) -> Path:
         try:
             (staging / MESH_FILE).write_text(obj_text(mesh))
             Image.fromarray(mesh.texture).save(staging / TEXTURE)
-            Image.fromarray(turntable(mesh)).save(staging / TURNTABLE)
+            Image.fromarray(turntable(mesh) if picture is None else picture).save(staging / TURNTABLE)
             (staging / CARD).write_text(card.text(mesh), encoding="utf-8")
             staging.chmod(0o755)
             os.rename(staging, target)
@@ -95,11 +124,16 @@ def keep(folder: Path, mesh: Mesh, card: Card) -> Path:
     return target
 
 
+def require_there(folder: Path, names: Sequence[str]) -> None:
+    """Raises SaccadeError if one of these objects is not in the set."""
+    for name in names:
+        if name not in own_names(folder):
+            there = ", ".join(own_names(folder)) or "none"
+            raise SaccadeError(f"object {told(name)} is not in {folder}: it holds {there}")
+
+
 def remove(folder: Path, name: str) -> None:
-    """Takes an object out of a set. Raises SaccadeError if it is not there, or cannot be removed."""
-    if name not in own_names(folder):
-        there = ", ".join(own_names(folder)) or "none"
-        raise SaccadeError(f"object {told(name)} is not in {folder}: it holds {there}")
+    """Takes an object out of a set. Raises SaccadeError if it cannot be removed."""
     with writing(folder / name, "object"):
         gone = folder / f".removed-{name}"
         shutil.rmtree(gone, ignore_errors=True)

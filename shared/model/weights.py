@@ -93,6 +93,11 @@ class Weights:
         return shared
 
     @property
+    def basis(self) -> str:
+        """What says which networks these are: a hash of the hashes of their files."""
+        return hashlib.sha256("".join(sorted(self.hashes.values())).encode()).hexdigest()
+
+    @property
     def names(self) -> tuple[str, ...]:
         """The objects that these weights know."""
         return tuple(card.name for card in self.cards)
@@ -192,11 +197,21 @@ def _file_name(name: str) -> str:
 
 def weights_in_use(config: Config) -> Weights:
     """The weights that a configuration names. Raises SaccadeError if they are missing or damaged."""
-    own = set_folder(config.scene.objects) is not None and config.perception.weights is None
-    if own and config.perception.architecture != OPEN and not (config.weights / MANIFEST).is_file():
-        raise SaccadeError(f"object set {told(config.scene.objects)} is one of your own, and this agent's networks "
-                           "know none such: add `--agent open`")
-    return Weights(config.weights)
+    objects, is_open = told(config.scene.objects), config.perception.architecture == OPEN
+    if set_folder(config.scene.objects) is None or config.perception.weights is not None:
+        return Weights(config.weights)
+    learn = f"`saccade objects learn --set {config.scene.objects}`"
+    if not (config.weights / MANIFEST).is_file():
+        raise SaccadeError(f"object set {objects} is not learnt: {learn}" if is_open else
+                           f"object set {objects} is one of your own, and this agent's networks know none such: add "
+                           "`--agent open`")
+    weights = Weights(config.weights)
+    if is_open and weights.manifest.get("networks_sha256") != weights.networks.basis:
+        raise SaccadeError(f"object set {objects} was learnt with other networks than these: {learn}")
+    lacking = [name for name in config.scene.names or () if name not in weights.names]
+    if is_open and lacking:
+        raise SaccadeError(f"object {told(lacking[0])} of the set {objects} is not learnt: {learn}")
+    return weights
 
 
 def write_weights(folder: Path, states: Mapping[str, Mapping[str, ArrayLike]], cards: tuple[ObjectCard, ...],
