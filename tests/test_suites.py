@@ -89,3 +89,10 @@ def test_a_suite_is_written_to_a_file_that_is_read_back(tmp_path):
     assert not (tmp_path / "none.json").exists()
     with pytest.raises(SaccadeError, match=r"'paper-500' is of the objects 'ycb': .* or choose from yaw-500"):
         suite_file("paper-500", config, tmp_path / "none.json")
+
+
+def test_of_a_large_set_at_most_five_objects_stand_on_a_table():
+    many = {f"{name}{n}": size for name, size in SIZES.items() for n in range(3)}
+    scenes = SUITES["paper-like"].draw(many, 0)
+    assert Counter(len(scene.objects) for scene in scenes) == dict.fromkeys(range(1, 6), 15 * 20)
+    assert {scene.target for scene in scenes} == set(many)
