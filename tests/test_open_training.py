@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 import torch
 
+from saccade.services.perception.cropping import warp
 from saccade.services.perception.likeness import LogOdds
 from saccade.services.perception.open_world import turned
 from saccade.services.perception.view_encoder import ViewEncoder
 from saccade.shared.errors import SaccadeError
 from saccade.shared.render.groceries import grocery
 from saccade.shared.world.geometry import INTRINSICS_PX, fibonacci_sphere, project
-from saccade.training.crops import warp
 from saccade.training.open.comparer import turn_between
 from saccade.training.open.composer import CropMaker
 from saccade.training.open.presence import fitted

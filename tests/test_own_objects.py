@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from saccade.app.cli.texts import configured
+from saccade.app.cli.texts import configured, is_list
 from saccade.app.objects.adding import add_meshes, learn_set, remove_objects
 from saccade.app.objects.learning import likeness
-from saccade.app.objects.lists import assembled, is_list, members_of
+from saccade.app.objects.lists import assembled, members_of
 from saccade.app.objects.showing import list_set, show_object
 from saccade.app.objects.store import (
     CARD,

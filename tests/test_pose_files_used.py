@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from saccade.services.camera import pose_picture
+from saccade.app.look import pose_picture
 from saccade.services.camera.core import build
 from saccade.services.camera.poses import read_poses
 from saccade.services.camera.sources import SourceImage

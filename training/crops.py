@@ -13,6 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from saccade.services.perception.cropping import warp
 from saccade.shared.render.views import ObjectViews
 from saccade.shared.world.windows import CROP_PX
 from saccade.training.strangers import strangers
@@ -137,18 +138,6 @@ def _half_tiles(views: ObjectViews) -> Tensor:
     shells, count = tiles.shape[:2]
     halves = [F.avg_pool2d(tiles[s].float(), 2).round().to(torch.uint8) for s in range(shells)]
     return torch.stack(halves).view(shells, count, 4, CROP_PX, CROP_PX)
-
-
-def warp(tiles: Tensor, center: Tensor, scale: Tensor, roll: Tensor, side_px: int = CROP_PX) -> Tensor:
-    """Draws tiles [B, C, h, w] on crops [B, C, side_px, side_px].
-
-    The centre [B, 2] is in half crop sides, the scale [B] in crop sides, the roll [B] in radians.
-    """
-    cos, sin = roll.cos() / scale, roll.sin() / scale
-    rows = torch.stack([torch.stack([cos, sin], -1), torch.stack([-sin, cos], -1)], dim=1)
-    theta = torch.cat([rows, -rows @ center[:, :, None]], dim=2)
-    grid = F.affine_grid(theta, [len(tiles), tiles.shape[1], side_px, side_px], align_corners=False)
-    return F.grid_sample(tiles, grid, align_corners=False)
 
 
 def _background(count: int, uniform) -> Tensor:

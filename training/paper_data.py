@@ -10,10 +10,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from saccade.services.perception.cropping import warp
 from saccade.services.perception.paper import CANVAS_PX, CROP_SIDE_M
 from saccade.shared.render.views import TILE_PX, ObjectViews
 from saccade.shared.world.windows import CROP_PX
-from saccade.training.crops import REFERENCE_SHELL, warp
+from saccade.training.crops import REFERENCE_SHELL
 from saccade.training.frames import FrameBatch
 
 # Limits of 0.40 m / range for every object in an image. Ranges are drawn uniformly; the paper does not say how.

@@ -44,7 +44,7 @@ class PoseCnnTask:
     def __init__(self, config: TrainingConfig, device: torch.device):
         torch.manual_seed(config.seed)
         meshes = [load_mesh(config.objects, name) for name in config.names]
-        self.scenes = RenderedScenes(meshes)
+        self.batches = Batches(config)
         self.ahead: Iterator[RenderedBatch] | None = None
         self.module = on_device(PoseNetwork(len(meshes)), device)
         self.config, self.device = config, device
@@ -58,7 +58,7 @@ class PoseCnnTask:
         self.symmetric = torch.tensor([name in config.symmetric for name in config.names], device=device)
 
     def _batch(self, count: int, step: int) -> RenderedBatch:
-        return self.scenes.compose(count, np.random.default_rng([self.config.seed, step])).to(self.device)
+        return self.batches.rendered(step, count).to(self.device)
 
     def _next(self, step: int) -> RenderedBatch:
         """The batch of a step. A GPU would wait for it, so other processes render ahead."""
@@ -132,7 +132,7 @@ class PoseCnnTask:
 class Batches(Dataset[RenderedBatch]):
     """The batches of a training run from a step on, rendered where they are asked for."""
 
-    def __init__(self, config: TrainingConfig, start: int):
+    def __init__(self, config: TrainingConfig, start: int = 0):
         self.config, self.start = config, start
 
     @functools.cached_property
@@ -144,8 +144,11 @@ class Batches(Dataset[RenderedBatch]):
         return self.config.steps_extraction - self.start
 
     def __getitem__(self, number: int) -> RenderedBatch:
-        rng = np.random.default_rng([self.config.seed, self.start + number])
-        return self.scenes.compose(self.config.batch_extraction, rng)
+        return self.rendered(self.start + number, self.config.batch_extraction)
+
+    def rendered(self, step: int, count: int) -> RenderedBatch:
+        """The batch of a step with `count` images, always the same."""
+        return self.scenes.compose(count, np.random.default_rng([self.config.seed, step]))
 
 
 def rendered_ahead(config: TrainingConfig, start: int, workers: int) -> Iterator[RenderedBatch]:

@@ -25,7 +25,7 @@ def show(file: Annotated[Path, typer.Argument(metavar="FILE", help="File or fold
          values: Values = None) -> None:
     """Say how a file of poses is understood: its format, number, times, extent and conventions."""
     from saccade.app.cli.texts import parse_value
-    from saccade.services.camera.pose_report import report
+    from saccade.app.look.pose_report import report
     from saccade.services.camera.poses import asked_of
     from saccade.services.camera.trajectories.reading import read_trajectory
     from saccade.shared.config import Config
@@ -35,7 +35,7 @@ def show(file: Annotated[Path, typer.Argument(metavar="FILE", help="File or fold
     for line in report(read):
         print(printable(line, LINE_LIMIT))
     if out is not None:
-        from saccade.services.camera.pose_picture import draw_poses
+        from saccade.app.look.pose_picture import draw_poses
 
         draw_poses(read, out)
         print(f"written to {out}")

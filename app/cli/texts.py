@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +19,16 @@ def configured(path: Path | None, given: dict[str, Any], values: list[str] | Non
 
     options = {key: value for key, value in given.items() if value is not None}
     config = load(path, agent_of(agent).preset).with_values(options | dict(map(parse_value, values or ())))
-    if "," in config.scene.objects or ":" in config.scene.objects:
-        from saccade.app.objects.lists import assembled, is_list
+    if not is_list(config.scene.objects):
+        return config
+    from saccade.app.objects.lists import assembled
 
-        if is_list(config.scene.objects):
-            folder = assembled(config.scene.objects, config.perception.architecture)
-            return config.with_values({"scene.objects": folder})
-    return config
+    return config.with_values({"scene.objects": assembled(config.scene.objects, config.perception.architecture)})
+
+
+def is_list(objects: str) -> bool:
+    """Whether this names objects, and not one set."""
+    return "," in objects or (":" in objects and os.sep not in objects)
 
 
 def parse_value(text: str) -> tuple[str, Any]:

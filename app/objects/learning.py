@@ -52,8 +52,9 @@ def learn(objects: str, folder: Path, show: Callable[[str, int, int], None]) -> 
             refused.append(str(error))
     cards, banks, is_whole = _known(target, networks.basis, digests)
     missing = [name for name in digests if name not in banks]
-    encoder = networks.fill(ViewEncoder(), "encoder")
-    assert isinstance(encoder, ViewEncoder)  # it is what was filled
+    encoder = ViewEncoder()
+    if missing:
+        networks.fill(encoder, "encoder")
     learnt = list[str]()
     for done, name in enumerate(missing):
         show(name, done, len(missing))

@@ -17,11 +17,6 @@ from saccade.shared.render.objects import load_mesh, names_of, own_names, ycb_fo
 Member = tuple[str, str]  # a set and an object in it
 
 
-def is_list(objects: str) -> bool:
-    """Whether this names objects, and not one set."""
-    return "," in objects or (":" in objects and os.sep not in objects)
-
-
 def assembled(objects: str, architecture: str) -> str:
     """The folder of a set with the listed objects, which is made if it is not there. It is learnt if the architecture
     needs no training.

@@ -55,3 +55,15 @@ class Cropper:
         ahead = np.maximum(-ray[:, 2], 1e-3)
         pixels = np.stack([cx + fx * ray[:, 0] / ahead, cy - fy * ray[:, 1] / ahead], axis=-1)
         return Window(pixels, window.scales * np.exp(correction[:, 2]), window.sides_m)
+
+
+def warp(tiles: Tensor, center: Tensor, scale: Tensor, roll: Tensor, side_px: int = CROP_PX) -> Tensor:
+    """Draws tiles [B, C, h, w] on crops [B, C, side_px, side_px].
+
+    The centre [B, 2] is in half crop sides, the scale [B] in crop sides, the roll [B] in radians.
+    """
+    cos, sin = roll.cos() / scale, roll.sin() / scale
+    rows = torch.stack([torch.stack([cos, sin], -1), torch.stack([-sin, cos], -1)], dim=1)
+    theta = torch.cat([rows, -rows @ center[:, :, None]], dim=2)
+    grid = F.affine_grid(theta, [len(tiles), tiles.shape[1], side_px, side_px], align_corners=False)
+    return F.grid_sample(tiles, grid, align_corners=False)

@@ -16,13 +16,12 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from saccade.services.perception.comparer import Compared, Comparison
-from saccade.services.perception.cropping import Cropper
+from saccade.services.perception.cropping import Cropper, warp
 from saccade.services.perception.likeness import COHORT, USUAL, Cohort, LogOdds
 from saccade.services.perception.proposer import Proposals, Proposer, half_tangent, propose
 from saccade.services.perception.seen import Modes, Seen, bits
 from saccade.services.perception.view_encoder import ViewEncoder
-from saccade.shared.errors import SaccadeError
-from saccade.shared.model.bank import FILLED, Bank, bank_of
+from saccade.shared.model.bank import FILLED, Bank, bank_in
 from saccade.shared.model.weights import Weights
 from saccade.shared.world.geometry import REFERENCE_RANGE_M, pixel_rays, pose, project, rotation_towards, unit
 from saccade.shared.world.windows import Window, upright
@@ -46,12 +45,7 @@ def open_world_of(weights: Weights, names: tuple[str, ...]) -> OpenWorld:
     """The networks and the banks of these objects. Raises SaccadeError if the weights lack one of them, are damaged, or
     are of another architecture."""
     weights.cards_of(names)
-    shared, banks = weights.networks, []
-    for name in names:
-        try:
-            banks.append(bank_of(name, weights.bank(name)))
-        except (ValueError, KeyError) as error:
-            raise SaccadeError(f"bank of {name} in {weights.folder} is damaged ({error}): make it again") from error
+    shared, banks = weights.networks, [bank_in(weights, name) for name in names]
     networks = [shared.fill(module, stem) for module, stem in (
         (Proposer(), "proposer"), (ViewEncoder(), "encoder"), (Comparison(), "comparer"))]
     proposer, encoder, comparison = networks
@@ -97,7 +91,6 @@ class OpenWorld:
         self.vectors = [torch.from_numpy(bank.vectors) for bank in banks]
         self.cohort = cohort
         self.likest = [cohort.likest(vectors) for vectors in self.vectors]
-        self.sharpness = SHARPNESS
 
     @torch.inference_mode()
     def see(self, rgb: NDArray[np.uint8], intrinsics_px: ArrayLike, up: ArrayLike,
@@ -123,7 +116,7 @@ class OpenWorld:
             seen.mask_bits[k] = bits(masks[match.thing, None].numpy())[0]
             others = [(view, row) for row, (object_, thing, view) in enumerate(pairs)
                       if object_ == k and thing == match.thing]
-            modes = placed.modes(similar[k][match.thing], others, self.sharpness)
+            modes = placed.modes(similar[k][match.thing], others, SHARPNESS)
             seen.modes[k] = modes
             assert seen.camera_from_object is not None  # `_nothing` made it
             seen.camera_from_object[k] = pose(modes.rotations[0], placed.ray * placed.range_m)
@@ -274,10 +267,8 @@ def turned(known: Array, turn: Array) -> Array:
 
 
 def rolled(crops: Tensor, angle: Tensor) -> Tensor:
-    """Crops [P, 4, 64, 64], turned by angles [P] (rad)."""
-    cos, sin, none = angle.cos(), angle.sin(), torch.zeros_like(angle)
-    rows = torch.stack([torch.stack([cos, sin, none], -1), torch.stack([-sin, cos, none], -1)], 1)
-    return F.grid_sample(crops, F.affine_grid(rows, list(crops.shape), align_corners=False), align_corners=False)
+    """Crops [P, C, 64, 64], turned by angles [P] (rad)."""
+    return warp(crops, torch.zeros(len(crops), 2), torch.ones(len(crops)), angle)
 
 
 def _turn(angle: float) -> Array:

@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from saccade.shared.errors import SaccadeError
+from saccade.shared.model.weights import Weights
 from saccade.shared.world.geometry import fibonacci_sphere
 from saccade.shared.world.windows import CROP_PX
 
@@ -69,6 +71,14 @@ def bank_of(name: str, arrays: Mapping[str, NDArray[Any]]) -> Bank:
     ends = np.cumsum(lengths.astype(np.int64))
     pictures = tuple(joined[end - length:end].tobytes() for end, length in zip(ends, lengths, strict=True))
     return Bank(name, circles, vectors, pictures)
+
+
+def bank_in(weights: Weights, name: str) -> Bank:
+    """The bank of an object in weights. Raises SaccadeError if it is missing or damaged."""
+    try:
+        return bank_of(name, weights.bank(name))
+    except (ValueError, KeyError) as error:
+        raise SaccadeError(f"bank of {name} in {weights.folder} is damaged ({error}): make it again") from error
 
 
 def compressed(images: NDArray[np.uint8]) -> tuple[bytes, ...]:

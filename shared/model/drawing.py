@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from saccade.shared.errors import SaccadeError
-from saccade.shared.model.bank import bank_of
+from saccade.shared.model.bank import bank_in
 from saccade.shared.model.latent import LEAK
 from saccade.shared.model.weights import Weights
 
@@ -58,10 +58,7 @@ class BankPictures:
     """Shows one object from its bank. Raises SaccadeError if the bank is missing or damaged."""
 
     def __init__(self, weights: Weights, name: str) -> None:
-        try:
-            self.bank = bank_of(name, weights.bank(name))
-        except (ValueError, KeyError) as error:
-            raise SaccadeError(f"bank of {name} in {weights.folder} is damaged ({error}): make it again") from error
+        self.bank = bank_in(weights, name)
 
     def nearest(self, towards: NDArray[np.float64]) -> int:
         """The view that is nearest to a direction [3] from the object to the camera."""

@@ -11,9 +11,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from saccade.services.perception.comparer import Compared, Comparison
+from saccade.services.perception.cropping import warp
 from saccade.services.perception.view_encoder import ViewEncoder
 from saccade.shared.world.geometry import rotation_towards
-from saccade.training.crops import warp
 from saccade.training.open.composer import Crops
 from saccade.training.open.encoder import Banks, batch
 from saccade.training.open.material import Material
@@ -41,7 +41,8 @@ class ComparerTask:
         self.comparison = on_device(Comparison(), device)
         self.lambdas: list[float] = []
         self.banks = Banks(self.encoder, material, range(len(material.tiles)))
-        self.strange = Banks(self.encoder, material, material.real)
+        real = torch.isin(self.banks.owner, torch.as_tensor(material.real, device=device))
+        self.all, self.scanned = torch.arange(len(real), device=device), real.nonzero()[:, 0]
 
     @property
     def module(self) -> Comparison:
@@ -51,7 +52,7 @@ class ComparerTask:
     def pairs(self, step: int, count: int) -> Pairs:
         """Pairs for a step."""
         rng = np.random.default_rng([self.config.seed, 2, step])
-        return pairs(self.material, self.encoder, self.banks, batch(self.material, count, rng), rng)
+        return pairs(self.material, self.encoder, self.banks, self.all, batch(self.material, count, rng), rng)
 
     def loss(self, step: int) -> tuple[Tensor, dict[str, float]]:
         """The loss at a step, and its parts."""
@@ -69,7 +70,7 @@ class ComparerTask:
         rng = np.random.default_rng([self.config.seed, 2 ** 31])
         held = self.material.held_out
         crops = held.draw(rng.choice(len(held.sights.table), EVALUATED), rng)
-        drawn = pairs(self.material, self.encoder, self.strange, crops, rng)
+        drawn = pairs(self.material, self.encoder, self.banks, self.scanned, crops, rng)
         compared = Compared(self.comparison(drawn.seen, drawn.known))
         same, other = drawn.label > 0.5, drawn.label < 0.5
         found = torch.cat([compared.shift, compared.log_ratio[:, None]], 1)
@@ -99,9 +100,11 @@ class Pairs:
 
 
 @torch.no_grad()
-def pairs(material: Material, encoder: ViewEncoder, banks: Banks, crops: Crops, rng: np.random.Generator) -> Pairs:
+def pairs(material: Material, encoder: ViewEncoder, banks: Banks, among: Tensor, crops: Crops,
+          rng: np.random.Generator) -> Pairs:
     """For each of B crops a known view from near its direction, and the one of another object or from elsewhere that
-    the encoder finds most alike; then pairs that show no thing, or a wrong part of one."""
+    the encoder finds most alike; then pairs that show no thing, or a wrong part of one. `among` are the numbers of
+    the banks' views that may be drawn."""
     maker, device, count = material.composed, crops.seen.device, len(crops.seen)
     generator = torch.Generator(device).manual_seed(int(rng.integers(2 ** 62)))
     which = crops.object.cpu().numpy()
@@ -115,7 +118,7 @@ def pairs(material: Material, encoder: ViewEncoder, banks: Banks, crops: Crops, 
     size = turned.norm(dim=1)
     same = torch.where(size < SAME_RAD, 1.0, torch.where(size > OTHER_RAD, 0.0, torch.nan))
 
-    some = torch.randperm(len(banks.owner), generator=generator, device=device)[:AMONG]
+    some = among[torch.randperm(len(among), generator=generator, device=device)[:AMONG]]
     close = (banks.owner[some] == crops.object[:, None]) \
         & ((crops.direction @ banks.directions[some].T).clamp(-1, 1).arccos() < OTHER_RAD)
     other = banks.views(some[_similar(encoder, crops.seen, banks.vectors[some]).masked_fill(close, -9.0).argmax(1)])

@@ -7,6 +7,7 @@ object's whole outline fills the share FILLED of the picture, but for what the c
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,10 +15,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from saccade.services.perception.cropping import warp
 from saccade.shared.model.bank import FILLED
 from saccade.shared.render.surfaces import SURFACES
 from saccade.shared.world.windows import CROP_PX
-from saccade.training.crops import warp
 from saccade.training.open.tiles import TILE_PX, Tiles
 
 BACKGROUNDS = 160  # surfaces that are made once
@@ -44,6 +45,16 @@ class Crops:
     direction: Tensor
     visible: Tensor
     off: Tensor
+
+
+def uniform_of(rng: np.random.Generator, device: torch.device) -> Callable[..., Tensor]:
+    """Draws numbers from 0 to 1 of any shape on a device, from a generator that is seeded by `rng`."""
+    generator = torch.Generator(device).manual_seed(int(rng.integers(2 ** 62)))
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator, device=device)
+
+    return uniform
 
 
 class CropMaker:
@@ -126,11 +137,7 @@ class CropMaker:
     def draw(self, which: np.ndarray, index: np.ndarray, rng: np.random.Generator) -> Crops:
         """Crops of the objects `which` [B], seen from the directions `index` [B]."""
         count = len(which)
-        generator = torch.Generator(self.device).manual_seed(int(rng.integers(2 ** 62)))
-
-        def uniform(*shape: int) -> Tensor:
-            return torch.rand(*shape, generator=generator, device=self.device)
-
+        uniform = uniform_of(rng, self.device)
         mine = self.tile(which, index, rng.integers(self.variants[which]))
         scale = ((uniform(count) * 2 - 1) * SCALE).exp()
         shift, roll = (uniform(count, 2) * 2 - 1) * 2 * SHIFT, (uniform(count) * 2 - 1) * ROLL_RAD
@@ -152,11 +159,7 @@ class CropMaker:
 
     def nothing(self, count: int, rng: np.random.Generator) -> Tensor:
         """Crops [B, 4, 64, 64] around no thing: a mask that fits nothing in the image."""
-        generator = torch.Generator(self.device).manual_seed(int(rng.integers(2 ** 62)))
-
-        def uniform(*shape: int) -> Tensor:
-            return torch.rand(*shape, generator=generator, device=self.device)
-
+        uniform = uniform_of(rng, self.device)
         which = rng.integers(len(self.tiles), size=count)
         image = self._background(count, uniform)
         beside = self._neighbour(which, rng, uniform, away=0.6)

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from saccade.services.perception.proposer import STRIDE, Proposer, places, propose, radius_px
 from saccade.shared.world.geometry import project
+from saccade.training.open.composer import uniform_of
 from saccade.training.open.table_crops import INTRINSICS, TableCrops
 from saccade.training.open.tables import FRAME_PX, MOST
 from saccade.training.settings import TrainingConfig
@@ -134,11 +135,7 @@ def images(crops: TableCrops, circles: Tensor, chosen: NDArray[np.int64], rng: n
     """Images [B, 3, 256, 256] of the tables `chosen` [B], changed at random, and their targets. `circles` are those of
     all tables, see `by_label`."""
     count = len(chosen)
-    generator = torch.Generator(device).manual_seed(int(rng.integers(2 ** 62)))
-
-    def uniform(*shape: int) -> Tensor:
-        return torch.rand(*shape, generator=generator, device=device)
-
+    uniform = uniform_of(rng, device)
     table = torch.as_tensor(chosen, device=device)
     rgb, instance = crops.rgb[table].permute(0, 3, 1, 2).float() / 255.0, crops.instance[table][:, None].float()
     # The frame's place of each pixel: turned, mirrored, enlarged and shifted.

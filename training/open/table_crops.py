@@ -15,7 +15,7 @@ from saccade.shared.model.bank import FILLED
 from saccade.shared.render.mesh import Mesh
 from saccade.shared.world.geometry import IMAGE_SIZE_PX, INTRINSICS_PX, circle_around, rotation_towards, unit
 from saccade.shared.world.windows import CROP_PX, upright
-from saccade.training.open.composer import ROLL_RAD, SCALE, SHIFT, CropMaker, Crops
+from saccade.training.open.composer import ROLL_RAD, SCALE, SHIFT, CropMaker, Crops, uniform_of
 from saccade.training.open.tables import FRAME_PX, Tables
 
 INTRINSICS = np.array(INTRINSICS_PX) * FRAME_PX / IMAGE_SIZE_PX
@@ -98,11 +98,7 @@ class TableCrops:
         """Crops of the sights `chosen` [B]. `known` shows the nearest of the views that banks have, or that with the
         number `index` [B]."""
         sights, device, count = self.sights, self.maker.device, len(chosen)
-        generator = torch.Generator(device).manual_seed(int(rng.integers(2 ** 62)))
-
-        def uniform(*shape: int) -> Tensor:
-            return torch.rand(*shape, generator=generator, device=device)
-
+        uniform = uniform_of(rng, device)
         scale = ((uniform(count) * 2 - 1) * SCALE).exp()
         shift, roll = (uniform(count, 2) * 2 - 1) * 2 * SHIFT, (uniform(count) * 2 - 1) * ROLL_RAD
         pixels = self._pixels(chosen, shift, scale, roll)

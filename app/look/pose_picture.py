@@ -1,22 +1,16 @@
-"""Draws the poses of a file, from above and from the side: each camera as a frustum, with the table's plane.
-
-Only the command line imports this module, because it needs matplotlib.
-"""
+"""Draws the poses of a file, from above and from the side: each camera as a frustum, with the table's plane."""
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
-from matplotlib.figure import Figure
 
+from saccade.app.look.picture import new_figure, save
 from saccade.services.camera.trajectories.trajectory import NAMES, Trajectory
-from saccade.shared.errors import SaccadeError, printable
-from saccade.shared.files import replace_whole, writing
+from saccade.shared.errors import printable
 from saccade.shared.world.geometry import Array
 
 INCHES, DPI = (13.0, 6.8), 100
@@ -31,8 +25,7 @@ PATH, CAMERA, TOP, LOOK, TABLE, FIRST = "#9aa5ad", "#2e4057", "#d1495b", "#00798
 def draw_poses(read: Trajectory, out: Path) -> None:
     """Draws a trajectory as a picture. The same poses give the same bytes. Raises SaccadeError if the file cannot be
     written."""
-    figure = Figure(figsize=INCHES, dpi=DPI, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(INCHES, DPI)
     above, side = figure.subplots(1, 2)
     size_m = _size_m(read.world_from_camera[:, :3, 3])
     _draw(above, read.world_from_camera, (0, 1), size_m)
@@ -45,7 +38,7 @@ def draw_poses(read: Trajectory, out: Path) -> None:
     figure.legend(*side.get_legend_handles_labels(), loc="outside lower center", ncols=4)
     name = printable(read.path.name, 80).replace("$", r"\$")
     figure.suptitle(f"{name}: {len(read.keys)} poses, {NAMES[read.format]}")
-    _save(figure, out)
+    save(figure, out)
 
 
 def _size_m(positions: Array) -> float:
@@ -77,13 +70,3 @@ def _draw(axes: Axes, poses: Array, shown: tuple[int, int], size_m: float) -> No
     axes.set_aspect("equal", adjustable="datalim")
     axes.autoscale_view()
     axes.grid(alpha=0.25)
-
-
-def _save(figure: Figure, out: Path) -> None:
-    drawn = io.BytesIO()
-    try:
-        figure.savefig(drawn, format=out.suffix[1:].lower() or "png", metadata={"Software": None})
-    except ValueError as error:
-        raise SaccadeError(f"picture {out} cannot be written ({error}): let its name end in .png") from error
-    with writing(out, "picture"):
-        replace_whole(out, drawn.getvalue())
