@@ -19,6 +19,7 @@ from saccade.shared.errors import SaccadeError
 from saccade.shared.log.reading import RunReader
 from saccade.shared.model.weights import MANIFEST, Weights
 from saccade.shared.render.objects import load_mesh
+from saccade.tests.fakes.logs import assert_replayed
 from saccade.tests.fakes.training import assert_same_checkpoint, interrupt_and_resume
 from saccade.tests.fakes.weights import write_random_weights
 from saccade.training.lexa.behaviour import achiever_loss, explorer_loss, returns
@@ -130,7 +131,7 @@ def test_the_state_is_a_fold_over_images_and_actions():
 
 
 @pytest.mark.parametrize("agent", ["lexa", "random-walk", "still"])
-def test_an_agent_runs_on_the_bus_and_in_one_process_alike(agent, tmp_path, finished):
+def test_an_agent_runs_on_the_bus_and_in_one_process_alike_and_is_replayed(agent, tmp_path, finished):
     logs = {}
     given = {"perception.weights": finished / "weights"} if agent == "lexa" else {}
     for kind in ("zenoh", "local"):
@@ -139,6 +140,7 @@ def test_an_agent_runs_on_the_bus_and_in_one_process_alike(agent, tmp_path, fini
         logs[kind] = [entry.payload for entry in RunReader(tmp_path / kind / "same" / "run.mcap").entries()
                       if entry.topic != STATUS]
     assert sorted(logs["zenoh"]) == sorted(logs["local"])
+    assert_replayed(tmp_path / "local" / "same" / "run.mcap", tmp_path / "replay", "planner")
     messages = [message for _, _, message in RunReader(tmp_path / "local" / "same" / "run.mcap")]
     moves = [np.linalg.norm(message.translation_m) for message in messages if isinstance(message, Action)]
     views = [message.world_from_camera for message in messages if isinstance(message, Frame)]

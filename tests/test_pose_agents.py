@@ -35,7 +35,7 @@ from saccade.shared.world.geometry import (
     rotation_xyz,
 )
 from saccade.shared.world.task import apply_action, start_pose, success
-from saccade.tests.fakes.logs import logged
+from saccade.tests.fakes.logs import assert_replayed, logged
 from saccade.tests.fakes.training import assert_same_checkpoint, interrupt_and_resume
 from saccade.tests.fakes.weights import write_random_weights
 from saccade.tests.samples import sample
@@ -128,7 +128,7 @@ def test_training_continues_as_if_it_had_not_been_interrupted_and_its_weights_se
 
 
 @pytest.mark.parametrize("agent", ["posecnn", "posecnn-infogain"])
-def test_an_agent_runs_on_the_bus_and_in_one_process_alike(agent, tmp_path, weights):
+def test_an_agent_runs_on_the_bus_and_in_one_process_alike_and_is_replayed(agent, tmp_path, weights):
     logs = {}
     for kind in ("zenoh", "local"):
         config = configured(None, EPISODE | {"bus.kind": kind, "perception.weights": weights}, [], agent)
@@ -137,6 +137,8 @@ def test_an_agent_runs_on_the_bus_and_in_one_process_alike(agent, tmp_path, weig
         logs[kind] = logged(out / "run.mcap")
         assert ("belief", "soup_can") in logs[kind] or agent == "posecnn"
     assert logs["zenoh"] == logs["local"]
+    into = ("perception", "planner") if agent == "posecnn" else ("perception", "belief", "planner")
+    assert_replayed(out / "run.mcap", tmp_path / "replay", *into)
     percepts = [m for topic, _, m in RunReader(out / "run.mcap") if isinstance(m, Percept)]
     assert percepts
     for percept in percepts:
@@ -214,8 +216,9 @@ def test_templates_find_how_an_object_is_turned():
     assert right >= 9
 
 
-def test_who_renders_and_compares_runs_within_one_process(tmp_path):
+def test_who_renders_and_compares_runs_within_one_process_and_is_replayed(tmp_path):
     config = configured(None, EPISODE | {"simulator.max_steps": 2, "bus.kind": "local"}, [], "render-and-compare")
     run(config, agent="render-and-compare", out=tmp_path / "r", plain=True, console=Console(file=io.StringIO()))
+    assert_replayed(tmp_path / "r" / "run.mcap", tmp_path / "replay", "perception", "belief", "planner")
     poses = [m.camera_from_object for _, _, m in RunReader(tmp_path / "r" / "run.mcap") if isinstance(m, Percept)]
     assert len(poses) == 2 * (2 + 1)

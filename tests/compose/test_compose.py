@@ -170,6 +170,24 @@ def test_another_agent_by_name_and_the_services_it_does_without_wait_for_the_end
     assert compose.log().complete, list(compose.log().lines())
 
 
+@pytest.mark.parametrize(("agent", "images"), [
+    ("posecnn", {}),
+    ("lexa", {"SACCADE_PLANNER_IMAGE": "planner-lexa"}),
+    ("render-and-compare", {"SACCADE_PERCEPTION_IMAGE": "perception-meshes"}),
+])
+def test_the_other_systems_run_in_containers(compose, agent, images):
+    scans = os.environ.get("SACCADE_YCB")
+    if scans is None:
+        pytest.skip("no YCB scans: set SACCADE_YCB to their folder")
+    said = compose.up("--build", SACCADE_AGENT=agent, SACCADE_OBJECTS="ycb", SACCADE_YCB=str(Path(scans).resolve()),
+                      SACCADE_SET="simulator.max_steps=5", timeout_s=BUILD_S, **images)
+    assert "in 5 steps" in said or "reached the goal in" in said, said
+    assert compose.log().complete, list(compose.log().lines())
+    topics = {topic for topic, _, _ in RunReader(compose.run / "run.mcap")}
+    assert ACTION in topics
+    assert (PERCEPT in topics) == (agent != "lexa")
+
+
 def test_a_second_simulator_is_refused_and_the_run_goes_on(compose):
     said = compose.up("--scale", "simulator=2")
     assert said.count("saccade: another simulator is in this world already") == 1

@@ -6,6 +6,8 @@ import math
 
 import numpy as np
 
+from saccade.app.replay.replay import prepare, replay_here
+from saccade.services.replayer.core import Keys, Pace
 from saccade.shared.bus.topics import BELIEF, FRAME, GOAL, PERCEPT, PLAN, RESULT, STATUS, TRUTH
 from saccade.shared.bus.wire import encode
 from saccade.shared.errors import SaccadeError
@@ -86,3 +88,10 @@ def write(path, messages, *, configuration="{}"):
 def of(messages, topic, part=None):
     """Those of one topic and part."""
     return [m for t, p, m in messages if t == topic and p == part]
+
+
+def assert_replayed(log, out, *into):
+    """Played into these services within this process, the log's inputs give again what it holds, to the byte."""
+    comparison = replay_here(prepare(log, into, {}, pace=Pace()), out, Keys(enabled=False), print).comparison
+    assert comparison.equal
+    assert comparison.unequal == 0
