@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from saccade.app.look.see import artist_of, drawing_of
+from saccade.services.perception.local_features import LocalFeatures
 from saccade.services.perception.view_encoder import ViewEncoder
 from saccade.services.viewer.imagination import Imagination
 from saccade.services.viewer.layout import VIEW_PX
@@ -37,7 +38,7 @@ def weights(mesh, tmp_path_factory):
     torch.manual_seed(0)
     folder = tmp_path_factory.mktemp("weights") / "own"
     card = ObjectCard(mesh.name, mesh.size_m, crop_side_m(mesh.size_m))
-    bank = bank_from(mesh, ViewEncoder().eval(), count=400)
+    bank = bank_from(mesh, ViewEncoder().eval(), LocalFeatures(), count=400)
     write_weights(folder, {}, (card,), {"architecture": "open", "networks": "open"}, {mesh.name: bank.arrays()})
     return Weights(folder)
 

@@ -22,6 +22,7 @@ from saccade.app.look.sights import Look, Sight
 from saccade.app.run.registry import AGENTS, agent_of
 from saccade.app.run.threads import limit_torch
 from saccade.services.perception.core import Model, model_of
+from saccade.services.perception.open_world import OpenWorld
 from saccade.services.perception.seen import Seen
 from saccade.shared.bus.messages import mask_of
 from saccade.shared.config import Config, load
@@ -53,6 +54,8 @@ class Looker:
         self.names = names_in_use(config.scene)
         self.weights = weights_in_use(config)
         self.model: Model = model_of(self.weights, self.names, config.perception.passes)
+        if isinstance(self.model, OpenWorld):
+            self.model.thorough = True  # nothing else says what stands in a photograph
         self.square: bool = getattr(self.model, "square", True)  # whether the networks take square images only
         self._draw = {name: artist_of(self.weights, name) for name in self.names if draw}
 

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from saccade.services.perception.view_encoder import ViewEncoder
 from saccade.shared.config import WEIGHTS, learned_folder
 from saccade.shared.errors import SaccadeError
 from saccade.shared.files import read_bytes
@@ -22,7 +21,7 @@ from saccade.shared.model.weights import OPEN, ObjectCard, Weights, write_weight
 from saccade.shared.render.mesh import MAX_FILE_BYTES, MESH_FILE
 from saccade.shared.render.objects import load_mesh, own_names
 from saccade.shared.render.views import crop_side_m
-from saccade.training.open.banks import bank_from
+from saccade.training.open.banks import BankMaker
 
 Arrays = dict[str, NDArray[Any]]
 SIZES_M = (0.002, 5.0)  # the largest side of an object
@@ -52,9 +51,7 @@ def learn(objects: str, folder: Path, show: Callable[[str, int, int], None]) -> 
             refused.append(str(error))
     cards, banks, is_whole = _known(target, networks.basis, digests)
     missing = [name for name in digests if name not in banks]
-    encoder = ViewEncoder()
-    if missing:
-        networks.fill(encoder, "encoder")
+    make = BankMaker(networks)
     learnt = list[str]()
     for done, name in enumerate(missing):
         show(name, done, len(missing))
@@ -64,7 +61,7 @@ def learn(objects: str, folder: Path, show: Callable[[str, int, int], None]) -> 
         except SaccadeError as error:
             refused.append(f"{error}; or remove it with `saccade objects remove {name}`")
             continue
-        banks[name] = bank_from(mesh, encoder).arrays()
+        banks[name] = make(mesh).arrays()
         cards[name] = ObjectCard(name, mesh.size_m, crop_side_m(mesh.size_m))
         _write(target, networks.basis, digests, cards, banks)
         learnt.append(name)

@@ -44,6 +44,16 @@ class Cropper:
         masks = F.grid_sample(self.masks[:, None], grid, align_corners=False)
         return crops, F.avg_pool2d(masks, 2)
 
+    def fine(self, window: Window, side_px: int) -> Tensor:
+        """Larger crops [K, 3, S, S] of S = `side_px`. Outside the image the border goes on."""
+        grid = torch.as_tensor(window.pixels_of(side_px, self.intrinsics_px, self.up) / self.size * 2 - 1,
+                               dtype=torch.float32)
+        texels = 2 * window.half_tangent * self.intrinsics_px[0] / side_px
+        levels = np.clip(np.round(np.log2(np.maximum(texels, 1e-6))), 0, _LEVELS - 1).astype(int)
+        crops = [F.grid_sample(self.pyramid[level], each[None], mode="bicubic", padding_mode="border",
+                               align_corners=False) for level, each in zip(levels, grid, strict=True)]
+        return torch.cat(crops).clamp(0.0, 1.0)
+
     def corrected(self, window: Window, correction: ArrayLike) -> Window:
         """The windows, changed by corrections [K, 3]: shift (du, dv) in crop sides and log of the scale's ratio."""
         fx, fy, cx, cy = self.intrinsics_px

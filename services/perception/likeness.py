@@ -4,23 +4,35 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 COHORT, LIKEST = "cohort", 50  # name of the cohort's file, and how many of its views count
+SURE, UNSURE = 20.0, 3.0  # landmarks
 UNIT = 0.05  # about the standard deviation of the largest similarities, so that normalised ones are as large as others
 
 
 @dataclass(frozen=True)
 class LogOdds:
     """The log odds that a thing is an object, against its being none that is known: `similar` times the similarity to
-    the object's view, and `compared` times the logit of the comparison, less `none`."""
+    the object's view, `compared` times the logit of the comparison, and `landmarks` times how sure the landmarks are
+    that fit, less `none`, and less `usual` times the logarithm of how many usually fit the object."""
 
-    similar: float = 20.0
-    compared: float = 0.3
-    none: float = 3.0
+    similar: float = 10.0
+    compared: float = 0.4
+    landmarks: float = 3.7
+    usual: float = 0.4
+    none: float = 2.0
 
-    def __call__(self, similar: Tensor, same: Tensor | float = 0.0) -> Tensor:
-        return self.similar * similar + self.compared * same - self.none
+    def __call__(self, similar: Tensor, same: Tensor, found: Tensor, usual: Tensor) -> Tensor:
+        return self.similar * similar + self.compared * same + self.landmarks * sure_of(found) \
+            - self.usual * torch.log1p(usual) - self.none
+
+
+def sure_of(found: Tensor) -> Tensor:
+    """How sure it is (0 to 1) that a pose is right which so many landmarks agree on. As many as `SURE` agree by chance
+    as often as not, where many are tried."""
+    return torch.sigmoid((found - SURE) / UNSURE)
 
 
 USUAL = LogOdds()  # until they are fitted

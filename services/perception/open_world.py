@@ -7,7 +7,8 @@ manifest says "architecture": "open".
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Mapping
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -16,25 +17,28 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from saccade.services.perception.comparer import Compared, Comparison
-from saccade.services.perception.cropping import Cropper, warp
-from saccade.services.perception.likeness import COHORT, USUAL, Cohort, LogOdds
+from saccade.services.perception.cropping import Cropper
+from saccade.services.perception.landmark_fit import FEATURES, Fit, LandmarkFit
+from saccade.services.perception.landmark_search import Found, LandmarkSearch
+from saccade.services.perception.likeness import COHORT, SURE, USUAL, Cohort, LogOdds
+from saccade.services.perception.local_features import LocalFeatures
+from saccade.services.perception.placed import Placed
 from saccade.services.perception.proposer import Proposals, Proposer, half_tangent, propose
 from saccade.services.perception.seen import Modes, Seen, bits
+from saccade.services.perception.things import FINE_PX, Match, Things, rolled
 from saccade.services.perception.view_encoder import ViewEncoder
 from saccade.shared.model.bank import FILLED, Bank, bank_in
 from saccade.shared.model.weights import Weights
-from saccade.shared.world.geometry import REFERENCE_RANGE_M, pixel_rays, pose, project, rotation_towards, unit
-from saccade.shared.world.windows import Window, upright
+from saccade.shared.world.geometry import REFERENCE_RANGE_M, pixel_rays, pose
+from saccade.shared.world.windows import Window
 
 INPUT_PX = 448  # the longer side of the image that the proposer sees
 GRAIN_PX = 16  # its sides are multiples of this
-MODES = 24  # likeliest views of an object that are told
 APART_RAD = 0.6  # views farther apart than this are compared separately
 CANDIDATES = 2  # things that are compared with each object, and views of each object that are compared with a thing
-CAP_RAD = 0.35  # views within this of a compared one are told as one, where the comparison says
-VIEW_STD_RAD = 0.12  # of a direction that is told by a view alone: about half of the way to the next one
 MASK_PX = 60
 SHARPNESS = 20.0  # of the similarities, where it is told how an object is turned
+LIKE_SOMETHING = 0.23  # a normalised similarity; a thing that is less like everything is rolled
 ROLLS_RAD = 2 * np.pi / 8 * np.arange(8)  # in which a thing is tried that is like nothing as it stands
 
 Array = NDArray[np.float64]
@@ -54,42 +58,23 @@ def open_world_of(weights: Weights, names: tuple[str, ...]) -> OpenWorld:
     assert isinstance(comparison, Comparison)
     fitted = {key: value for key, value in shared.calibration.items() if key in LogOdds.__annotations__}
     cohort = Cohort(torch.from_numpy(shared.state(COHORT)["vectors"]))
-    return OpenWorld(proposer, encoder, comparison, banks, cohort, LogOdds(**fitted))
-
-
-@dataclass(frozen=True)
-class Things:
-    """P things that were proposed: their crops with masks [P, 4, 64, 64] and the windows of these, and their masks in
-    the image [P, h, w]. The crops are rolled by the angles `roll` [P] (rad)."""
-
-    crops: Tensor
-    window: Window
-    masks: Tensor
-    roll: Array
-
-
-@dataclass(frozen=True)
-class Match:
-    """An object found in a thing: the number of the thing, the probability, the view of its bank that was compared, and
-    the row of the comparison."""
-
-    thing: int
-    presence: float
-    view: int
-    row: int
+    return OpenWorld(proposer, encoder, comparison, LocalFeatures(), banks, cohort, LogOdds(**fitted))
 
 
 class OpenWorld:
     """The networks, with the banks of K objects."""
 
     square = False  # an image may have any sides
+    thorough = False  # whether landmarks are searched for in everything
 
-    def __init__(self, proposer: Proposer, encoder: ViewEncoder, comparison: Comparison, banks: list[Bank],
-                 cohort: Cohort, log_odds: LogOdds = USUAL):
+    def __init__(self, proposer: Proposer, encoder: ViewEncoder, comparison: Comparison, features: LocalFeatures,
+                 banks: list[Bank], cohort: Cohort, log_odds: LogOdds = USUAL):
         self.proposer, self.encoder, self.comparison = proposer.eval(), encoder.eval(), comparison.eval()
         self.banks, self.log_odds = banks, log_odds
         self.vectors = [torch.from_numpy(bank.vectors) for bank in banks]
-        self.cohort = cohort
+        self.features, self.cohort = features, cohort
+        self.fits = [LandmarkFit(bank.landmarks) for bank in banks]
+        self.search = LandmarkSearch(features, self.fits)
         self.likest = [cohort.likest(vectors) for vectors in self.vectors]
 
     @torch.inference_mode()
@@ -102,13 +87,16 @@ class OpenWorld:
         seen = _nothing(count, rgb.shape)
         if not len(things.crops):
             return seen
-        things, similar = self.rolled_things(things)
-        pairs = [pair for k in range(count) for pair in self._candidates(k, similar[k])]
+        found = self.search(things, ROLLS_RAD.tolist()) if self.thorough else {}
+        things, similar = self.rolled_things(things, found)
+        pairs = [pair for k in range(count) for pair in self._candidates(k, similar[k], found)]
         known = torch.stack([self.view(k, view) for k, _, view in pairs])
         compared = Compared(self.comparison(things.crops[[thing for _, thing, _ in pairs]], known))
         masks = F.interpolate(things.masks[:, None], size=(MASK_PX, MASK_PX), mode="bilinear")[:, 0] > 0.5
         alike = torch.stack([similar[k][thing, view] for k, thing, view in pairs])
-        for k, match in enumerate(self._matches(pairs, self.log_odds(alike, compared.same).double().numpy())):
+        fits = self.fitted(things, {(k, thing) for k, thing, _ in pairs})
+        odds = self.log_odds(alike, compared.same, *self.found(pairs, fits)).double().numpy()
+        for k, match in enumerate(self._matches(pairs, odds, fits)):
             seen.presence[k] = match.presence
             placed = Placed(self.banks[k], match, compared, things, intrinsics_px, up)
             seen.pixel[k], seen.scale[k] = placed.pixel, REFERENCE_RANGE_M / placed.range_m
@@ -129,39 +117,68 @@ class OpenWorld:
         return [self.cohort.normalised(vectors @ bank.T, mine, likest)
                 for bank, likest in zip(self.vectors, self.likest, strict=True)]
 
-    def rolled_things(self, things: Things) -> tuple[Things, list[Tensor]]:
-        """Things, each rolled so that it is most like something, and their similarities to the views of each object.
+    def rolled_things(self, things: Things, found: Mapping[int, Found] | None = None) -> tuple[Things, list[Tensor]]:
+        """Things, each rolled as it was found, or else so that it is most like something; and their similarities to the
+        views of each object.
 
         What is like something as it stands stays so: most things stand.
         """
-        similar = self._similar(things.crops)
+        found = found or {}
+        crops, fine, roll = things.crops.clone(), things.fine.clone(), things.roll.copy()
+        for thing, each in found.items():
+            if each.roll and each.inliers >= SURE:
+                angle = torch.tensor([each.roll], dtype=torch.float32)
+                crops[thing], fine[thing] = rolled(crops[thing, None], angle)[0], rolled(fine[thing, None], angle)[0]
+                roll[thing] = each.roll
+        similar = self._similar(crops)
         best = torch.stack([each.max(1).values for each in similar], 1).max(1).values
-        lying = torch.nonzero(self.log_odds(best) < 0.0)[:, 0]
-        if not len(lying):
-            return things, similar
-        crops, roll = things.crops.clone(), things.roll.copy()
-        angles = torch.tensor(ROLLS_RAD[1:], dtype=torch.float32)
-        turned = rolled(crops[lying].repeat_interleave(len(angles), 0), angles.repeat(len(lying)))
-        others = self._similar(turned)
-        alike = torch.stack([each.max(1).values for each in others], 1).max(1).values.view(len(lying), len(angles))
-        for n, thing in enumerate(lying.tolist()):
-            number = int(alike[n].argmax())
-            if alike[n, number] > best[thing]:
-                row = n * len(angles) + number
-                crops[thing], roll[thing] = turned[row], ROLLS_RAD[1 + number]
-                for mine, other in zip(similar, others, strict=True):
-                    mine[thing] = other[row]
-        return replace(things, crops=crops, roll=roll), similar
+        is_found = torch.tensor([thing in found and found[thing].inliers >= SURE for thing in range(len(crops))])
+        lying = torch.nonzero((best < LIKE_SOMETHING) & ~is_found)[:, 0]
+        if len(lying):
+            angles = torch.tensor(ROLLS_RAD[1:], dtype=torch.float32)
+            turned = rolled(crops[lying].repeat_interleave(len(angles), 0), angles.repeat(len(lying)))
+            others = self._similar(turned)
+            alike = torch.stack([each.max(1).values for each in others], 1).max(1).values.view(len(lying), -1)
+            for n, thing in enumerate(lying.tolist()):
+                number = int(alike[n].argmax())
+                if alike[n, number] > best[thing]:
+                    row = n * len(angles) + number
+                    crops[thing], roll[thing] = turned[row], ROLLS_RAD[1 + number]
+                    fine[thing] = rolled(fine[thing, None], angles[number, None])[0]
+                    for mine, other in zip(similar, others, strict=True):
+                        mine[thing] = other[row]
+        return replace(things, crops=crops, fine=fine, roll=roll), similar
+
+    @torch.inference_mode()
+    def fitted(self, things: Things, pairs: Collection[tuple[int, int]]) -> dict[tuple[int, int], Fit]:
+        """How the landmarks of objects fit things, for those of the `pairs` (object, thing) where enough do."""
+        wanted = sorted({thing for _, thing in pairs})
+        found = dict(zip(wanted, self.features(things.fine[wanted], FEATURES), strict=True))
+        fits = {}
+        for k, thing in sorted(pairs):
+            half = float(things.window.half_tangent[thing])
+            fit = self.fits[k](found[thing], FINE_PX / 2 / half, FINE_PX)
+            if fit is not None:
+                fits[k, thing] = fit
+        return fits
+
+    def found(self, pairs: list[tuple[int, int, int]], fits: Mapping[tuple[int, int], Fit]) -> tuple[Tensor, Tensor]:
+        """How many landmarks fit for each of the pairs (object, thing, view), and how many are usual for the object."""
+        count = [fits[k, thing].inliers if (k, thing) in fits else 0 for k, thing, _ in pairs]
+        usual = [self.banks[k].landmarks.usual for k, _, _ in pairs]
+        return torch.tensor(count, dtype=torch.float32), torch.tensor(usual)
 
     def view(self, k: int, view: int) -> Tensor:
         """A view of a bank [4, 64, 64] from 0 to 1."""
         return torch.from_numpy(self.banks[k].image(view).copy()).permute(2, 0, 1).float() / 255.0
 
-    def _candidates(self, k: int, similar: Tensor) -> list[tuple[int, int, int]]:
-        """Which things [P, V] are compared with object k, and with which of its views: (object, thing, view)."""
+    def _candidates(self, k: int, similar: Tensor, found: Mapping[int, Found]) -> list[tuple[int, int, int]]:
+        """Which things are compared with object k, and with which of its views: (object, thing, view). Things are like
+        it by `similar` [P, V], or it was found there."""
         directions = self.banks[k].directions
+        likest = similar.max(1).values.topk(min(CANDIDATES, len(similar))).indices.tolist()
         pairs = []
-        for thing in similar.max(1).values.topk(min(CANDIDATES, len(similar))).indices.tolist():
+        for thing in sorted({*likest, *(n for n, each in found.items() if each.object == k and each.inliers >= SURE)}):
             left = similar[thing].clone()
             for _ in range(CANDIDATES):
                 view = int(left.argmax())
@@ -169,7 +186,8 @@ class OpenWorld:
                 left[torch.from_numpy(directions @ directions[view] > np.cos(APART_RAD))] = -np.inf
         return pairs
 
-    def _matches(self, pairs: list[tuple[int, int, int]], log_odds: Array) -> list[Match]:
+    def _matches(self, pairs: list[tuple[int, int, int]], log_odds: Array,
+                 fits: Mapping[tuple[int, int], Fit]) -> list[Match]:
         """Where each object is likeliest. A thing is one object, or none of them: `log_odds` are those against none."""
         odds = np.exp(np.clip(log_odds, -30, 30))
         best: dict[tuple[int, int], int] = {}  # the row of the likeliest view of each object in each thing
@@ -182,7 +200,7 @@ class OpenWorld:
         matches = []
         for k in range(len(self.banks)):
             presence, thing, row = max((float(odds[r]) / total[t], t, r) for (o, t), r in best.items() if o == k)
-            matches.append(Match(thing, presence, pairs[row][2], row))
+            matches.append(Match(thing, presence, pairs[row][2], row, fits.get((k, thing))))
         return matches
 
     @torch.inference_mode()
@@ -207,73 +225,11 @@ class OpenWorld:
         window = Window(pixels, np.ones(len(found)), 2 * REFERENCE_RANGE_M * tangent / FILLED)
         cropper = Cropper(image, found.masks, intrinsics_px, up)
         if not len(found):
-            return Things(torch.zeros(0, 4, 64, 64), window, found.masks, np.zeros(0))
+            nothing = torch.zeros(0, 4, 64, 64), torch.zeros(0, 3, FINE_PX, FINE_PX)
+            return Things(*nothing, window, found.masks, np.zeros(0))
         crops, masks = cropper.cut(window)
-        return Things(torch.cat([crops, masks], 1), window, found.masks, np.zeros(len(found)))
-
-
-class Placed:
-    """Where an object is that was found: its ray in the camera's frame [3], its range, and how it may be turned."""
-
-    def __init__(self, bank: Bank, match: Match, compared: Compared, things: Things, intrinsics_px: ArrayLike,
-                 up: ArrayLike):
-        self.bank, self.compared, self.up = bank, compared, np.asarray(up, dtype=np.float64)
-        row, window = match.row, things.window
-        half, as_cut = float(window.half_tangent[match.thing]), float(things.roll[match.thing])
-        self.roll = float(compared.roll[row]) - as_cut
-        right, down, radius_m = bank.circles_m[match.view]
-        self.range_m = radius_m / (half * FILLED * float(compared.log_ratio[row].exp()))
-        aside = _turn(self.roll) @ np.array([right, down]) / self.range_m
-        tangent = _turn(-as_cut) @ compared.shift[row].double().numpy() * half - aside
-        rotation = upright(pixel_rays(window.pixels[match.thing, None], intrinsics_px), self.up)[0]
-        self.ray = unit(rotation @ np.array([tangent[0], -tangent[1], -1.0]))
-        self.pixel = project(self.ray, np.eye(4), intrinsics_px)[0]
-        shift_std, self.log_scale_std = compared.deviation[row, :2].tolist()
-        self.pixel_std = float(shift_std * half * np.asarray(intrinsics_px)[0])
-
-    def modes(self, similar: Tensor, compared: list[tuple[int, int]], sharpness: float) -> Modes:
-        """How the object may be turned, by the similarities [V] to its views, of which some were `compared` (view,
-        row): around these the direction is known better."""
-        directions = self.bank.directions
-        share = (sharpness * (similar - similar.max())).double().exp().numpy()
-        rows = [row for _, row in compared]
-        near = np.argmax(directions @ directions[[view for view, _ in compared]].T, axis=1)
-        share = share * self.compared.same[rows].sigmoid().double().numpy()[near]
-        towards: list[Array] = []
-        weights: list[float] = []
-        for view, row in compared:
-            cap = directions @ directions[view] > np.cos(CAP_RAD)
-            towards.append(turned(directions[view], self.compared.turn[row].double().numpy()))
-            weights.append(float(share[cap].sum()))
-            share = np.where(cap, 0.0, share)
-        rest = np.argsort(-share)[:MODES - len(compared)]
-        deviation = np.concatenate([self.compared.deviation[rows, 2], np.full(len(rest), VIEW_STD_RAD)])
-        weight = np.maximum(np.concatenate([weights, share[rest]]), 1e-12)
-        order = np.argsort(-weight)
-        camera = upright(self.ray[None], self.up)[0]
-        roll = np.eye(3)
-        roll[:2, :2] = _turn(self.roll).T
-        all_towards = np.concatenate([towards, directions[rest]])[order]
-        rotations = camera @ roll @ rotation_towards(-all_towards).transpose(0, 2, 1)
-        return Modes(rotations, np.log(weight[order] / weight.sum()), deviation[order])
-
-
-def turned(known: Array, turn: Array) -> Array:
-    """The direction [3] that lies an angle to the right and one up [2] (rad) from the direction `known` [3], as its
-    camera sees its own motion."""
-    angle = float(np.linalg.norm(turn))
-    flat = turn * (np.sin(angle) / max(angle, 1e-9))
-    return rotation_towards(-known) @ np.array([flat[0], flat[1], np.cos(angle)])
-
-
-def rolled(crops: Tensor, angle: Tensor) -> Tensor:
-    """Crops [P, C, 64, 64], turned by angles [P] (rad)."""
-    return warp(crops, torch.zeros(len(crops), 2), torch.ones(len(crops)), angle)
-
-
-def _turn(angle: float) -> Array:
-    """The rotation [2, 2] of a picture (right, down) by an angle (rad)."""
-    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        return Things(torch.cat([crops, masks], 1), cropper.fine(window, FINE_PX), window, found.masks,
+                      np.zeros(len(found)))
 
 
 def _nothing(count: int, shape: tuple[int, ...]) -> Seen:

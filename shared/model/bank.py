@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from saccade.shared.errors import SaccadeError
+from saccade.shared.model.landmarks import Landmarks, landmarks_of
 from saccade.shared.model.weights import Weights
 from saccade.shared.world.geometry import fibonacci_sphere
 from saccade.shared.world.windows import CROP_PX
@@ -30,12 +31,14 @@ MAX_VIEWS = 5_000
 class Bank:
     """V views of an object. directions [V, 3] point from the object's centre to the camera, in the object's frame.
     circles_m [V, 3] are the circles around its outline, in metres at its centre: where they are (right, down) from it,
-    and their radii. vectors [V, D] are the views' encodings. The pictures are held compressed."""
+    and their radii. vectors [V, D] are the views' encodings. The pictures are held compressed. The landmarks have views
+    of their own."""
 
     name: str
     circles_m: NDArray[np.float64]
     vectors: NDArray[np.float32]
     pictures: tuple[bytes, ...]
+    landmarks: Landmarks
 
     @property
     def directions(self) -> NDArray[np.float64]:
@@ -44,16 +47,14 @@ class Bank:
 
     def image(self, view: int) -> NDArray[np.uint8]:
         """A view [64, 64, 4] uint8: RGB, premultiplied by the coverage, and the coverage."""
-        with Image.open(io.BytesIO(self.pictures[view])) as picture:
-            image = np.asarray(picture.convert("RGBA"))
-        # The compression leaves colours where nothing is covered.
-        return np.concatenate([np.minimum(image[..., :3], image[..., 3:]), image[..., 3:]], axis=2)
+        return picture(self.pictures[view])
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """What is kept in a file."""
         lengths = np.array([len(picture) for picture in self.pictures], dtype=np.uint32)
         return {"circles_m": self.circles_m.astype(np.float32), "vectors": self.vectors.astype(np.float16),
-                "pictures": np.frombuffer(b"".join(self.pictures), dtype=np.uint8), "lengths": lengths}
+                "pictures": np.frombuffer(b"".join(self.pictures), dtype=np.uint8), "lengths": lengths,
+                **self.landmarks.arrays()}
 
 
 def bank_of(name: str, arrays: Mapping[str, NDArray[Any]]) -> Bank:
@@ -70,7 +71,7 @@ def bank_of(name: str, arrays: Mapping[str, NDArray[Any]]) -> Bank:
         raise ValueError("its views are not as many as its pictures, or are no numbers")
     ends = np.cumsum(lengths.astype(np.int64))
     pictures = tuple(joined[end - length:end].tobytes() for end, length in zip(ends, lengths, strict=True))
-    return Bank(name, circles, vectors, pictures)
+    return Bank(name, circles, vectors, pictures, landmarks_of(arrays))
 
 
 def bank_in(weights: Weights, name: str) -> Bank:
@@ -79,6 +80,14 @@ def bank_in(weights: Weights, name: str) -> Bank:
         return bank_of(name, weights.bank(name))
     except (ValueError, KeyError) as error:
         raise SaccadeError(f"bank of {name} in {weights.folder} is damaged ({error}): make it again") from error
+
+
+def picture(data: bytes) -> NDArray[np.uint8]:
+    """A view [64, 64, 4] from its compressed picture, see `Bank.image`."""
+    with Image.open(io.BytesIO(data)) as opened:
+        image = np.asarray(opened.convert("RGBA"))
+    # The compression leaves colours where nothing is covered.
+    return np.concatenate([np.minimum(image[..., :3], image[..., 3:]), image[..., 3:]], axis=2)
 
 
 def compressed(images: NDArray[np.uint8]) -> tuple[bytes, ...]:

@@ -155,14 +155,6 @@ def load_material(run_dir: Path, config: TrainingConfig, device: torch.device) -
                     maker, tables, held)
 
 
-def load_held_out(run_dir: Path, config: TrainingConfig) -> TableCrops:
-    """Reads the tables to evaluate on, and the views of the scanned objects. Raises SaccadeError if they are missing or
-    damaged."""
-    names = Objects(config).scanned
-    maker = CropMaker(list(load_tiles(run_dir / "views", names)), torch.device("cpu"), config.seed)
-    return _table_crops([_shard(run_dir, HELD)], {name: n for n, name in enumerate(names)}, maker)
-
-
 def _table_crops(paths: list[Path], numbers: dict[str, int], maker: CropMaker) -> TableCrops:
     """The tables of several shards as one, with the run's numbers of their objects."""
     rgb, instance, sights, start = [], [], [], 0

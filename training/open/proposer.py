@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import torch
 import torch.nn.functional as F
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 from torch import Tensor
 
 from saccade.services.perception.proposer import STRIDE, Proposer, places, propose, radius_px
 from saccade.shared.world.geometry import project
 from saccade.training.open.composer import uniform_of
-from saccade.training.open.table_crops import INTRINSICS, TableCrops
+from saccade.training.open.table_crops import INTRINSICS, Sights, TableCrops
 from saccade.training.open.tables import FRAME_PX, MOST
 from saccade.training.settings import TrainingConfig
 from saccade.training.tasks import on_device
@@ -46,7 +46,7 @@ class ProposerTask:
         torch.manual_seed(config.seed)
         self.config, self.tables, self.held_out, self.device = config, tables, held_out, device
         self.proposer = on_device(Proposer(), device)
-        self.circles, self.held_circles = by_label(tables, device), circles_px(held_out)
+        self.circles, self.held_circles = by_label(tables, device), circles_px(held_out.sights)
         self.lambdas: list[float] = []
 
     @property
@@ -114,11 +114,11 @@ class ProposerTask:
         Image.fromarray((both.clamp(0, 1) * 255).byte().permute(1, 2, 0).cpu().numpy()).save(path)
 
 
-def circles_px(crops: TableCrops) -> NDArray[np.float64]:
-    """The circles [N, 3] of sights in the frames: centre (u, v) and radius in pixels."""
-    ray = -crops.sights.rotation[:, :, 2]
-    center, ahead = project(ray, np.eye(4), INTRINSICS)
-    return np.concatenate([center, radius_px(crops.sights.half_tangent, ahead, INTRINSICS[0])[:, None]], axis=1)
+def circles_px(sights: Sights, intrinsics_px: ArrayLike = INTRINSICS) -> NDArray[np.float64]:
+    """The circles [N, 3] of sights in images with these intrinsics: centre (u, v) and radius in pixels."""
+    center, ahead = project(-sights.rotation[:, :, 2], np.eye(4), intrinsics_px)
+    radius = radius_px(sights.half_tangent, ahead, float(np.asarray(intrinsics_px)[0]))
+    return np.concatenate([center, radius[:, None]], axis=1)
 
 
 def by_label(crops: TableCrops, device: torch.device) -> Tensor:
@@ -126,7 +126,7 @@ def by_label(crops: TableCrops, device: torch.device) -> Tensor:
     a thing is seen."""
     sights = crops.sights
     circles = torch.full((len(crops.rgb), MOST + 1, 3), torch.nan)
-    circles[sights.table, sights.slot + 1] = torch.tensor(circles_px(crops), dtype=torch.float32)
+    circles[sights.table, sights.slot + 1] = torch.tensor(circles_px(crops.sights), dtype=torch.float32)
     return circles.to(device)
 
 

@@ -38,11 +38,12 @@ class Tables:
     whole_px: NDArray[np.int32]
 
 
-def render_tables(meshes: tuple[Mesh, ...], count: int, rng: np.random.Generator) -> Tables:
-    """Renders `count` tables with objects of `meshes`. All randomness comes from `rng`."""
-    intrinsics = np.array(INTRINSICS_PX) * FRAME_PX / IMAGE_SIZE_PX
-    world, names = World(meshes, size_px=FRAME_PX, intrinsics_px=intrinsics), tuple(mesh.name for mesh in meshes)
-    shape = (count, FRAME_PX, FRAME_PX)
+def render_tables(meshes: tuple[Mesh, ...], count: int, rng: np.random.Generator, side_px: int = FRAME_PX) -> Tables:
+    """Renders `count` tables with objects of `meshes`, in images of side_px x side_px. All randomness comes from
+    `rng`."""
+    intrinsics = np.array(INTRINSICS_PX) * side_px / IMAGE_SIZE_PX
+    world, names = World(meshes, size_px=side_px, intrinsics_px=intrinsics), tuple(mesh.name for mesh in meshes)
+    shape = (count, side_px, side_px)
     tables = Tables(names, np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.uint8),
                     np.full((count, MOST), -1, np.int16), np.zeros((count, MOST, 4, 4), np.float32),
                     np.zeros((count, MOST), np.int32))

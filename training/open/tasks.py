@@ -13,22 +13,27 @@ from torch import Tensor
 
 from saccade.services.perception.comparer import Comparison
 from saccade.services.perception.likeness import Cohort, LogOdds
+from saccade.services.perception.local_features import LocalFeatures
 from saccade.services.perception.open_world import OpenWorld
 from saccade.services.perception.proposer import Proposer
 from saccade.services.perception.view_encoder import ViewEncoder
 from saccade.shared.model.weights import Weights
 from saccade.shared.render.objects import load_mesh
+from saccade.shared.world.geometry import IMAGE_SIZE_PX
 from saccade.training.checkpoints import finished
-from saccade.training.open.banks import bank_from, bank_of_tiles
+from saccade.training.open.banks import BankMaker, bank_of_tiles
 from saccade.training.open.comparer import ComparerTask
 from saccade.training.open.composer import CropMaker
 from saccade.training.open.encoder import AT_A_TIME, EncoderTask
-from saccade.training.open.material import Objects, load_held_out, load_material
+from saccade.training.open.material import Objects, load_material
 from saccade.training.open.presence import fit_presence
 from saccade.training.open.proposer import ProposerTask
+from saccade.training.open.table_crops import sights_of
+from saccade.training.open.tables import render_tables
 from saccade.training.open.tiles import load_tiles
 from saccade.training.settings import TrainingConfig
 
+JUDGED_OF = 400  # tables on which the log odds are fitted, where 6,000 are trained on
 OF_EACH = 3  # views of each thing that nobody knows in the cohort
 
 
@@ -57,22 +62,23 @@ def judged(run_dir: Path, config: TrainingConfig,
     assert isinstance(proposer, Proposer)  # as they were just made
     assert isinstance(encoder, ViewEncoder)
     assert isinstance(comparison, Comparison)
-    tables, objects = load_held_out(run_dir, config), Objects(config)
-    banks = {number: bank_of_tiles(tiles, objects.mesh(tiles.name), encoder)
-             for number, tiles in enumerate(tables.maker.tiles)}
+    objects, features, rng = Objects(config), LocalFeatures(), np.random.default_rng([config.seed, 17])
+    meshes = [objects.mesh(name) for name in objects.scanned]
+    banks = {number: bank_of_tiles(tiles, mesh, encoder, features) for number, (tiles, mesh)
+             in enumerate(zip(load_tiles(run_dir / "views", objects.scanned), meshes, strict=True))}
+    tables = render_tables(tuple(meshes), max(JUDGED_OF // 60, config.tables * JUDGED_OF // 6000), rng, IMAGE_SIZE_PX)
+    sights = sights_of(tables, meshes, {name: number for number, name in enumerate(objects.scanned)})
     strangers = CropMaker(list(load_tiles(run_dir / "views", objects.made or objects.scanned)), torch.device("cpu"))
-    rng = np.random.default_rng([config.seed, 17])
     which = np.repeat(np.arange(len(strangers.tiles)), OF_EACH)
     with torch.inference_mode():
         vectors = torch.cat([encoder(strangers.known(part, rng.integers(strangers.views[part])))
                              for part in np.array_split(which, -(-len(which) // AT_A_TIME))])
-    model = OpenWorld(proposer, encoder, comparison, [], Cohort(vectors))
-    return vectors, fit_presence(model, banks, tables, np.random.default_rng(config.seed))
+    model = OpenWorld(proposer, encoder, comparison, features, [], Cohort(vectors))
+    return vectors, fit_presence(model, banks, tables, sights, np.random.default_rng(config.seed))
 
 
 def banks_for(config: TrainingConfig, networks: Path) -> dict[str, dict[str, NDArray[Any]]]:
     """The banks of the run's objects, by the networks in a folder. Raises SaccadeError if these are missing or
     damaged, or if a mesh is missing."""
-    encoder = Weights(networks).fill(ViewEncoder(), "encoder")
-    assert isinstance(encoder, ViewEncoder)  # it is what was filled
-    return {name: bank_from(load_mesh(config.objects, name), encoder).arrays() for name in config.names}
+    make = BankMaker(Weights(networks))
+    return {name: make(load_mesh(config.objects, name)).arrays() for name in config.names}

