@@ -11,16 +11,17 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from saccade.services.planner.free_energy import Terms, expected_free_energy
 from saccade.services.planner.goal import Preference, aim, infer_preference
+from saccade.services.planner.goal_views import Side, peak_eye
 from saccade.services.planner.motion import step_towards
 from saccade.shared.bus.messages import Action, Belief, Plan
 from saccade.shared.bus.topics import ACTION, BELIEF, GOAL_PERCEPT, PLAN, Output
 from saccade.shared.config import Config
 from saccade.shared.loop.seeding import generator
 from saccade.shared.loop.service import Inputs, Service
+from saccade.shared.model.object_card import symmetries
 from saccade.shared.model.weights import Weights
 from saccade.shared.world.geometry import (
     Array,
@@ -30,7 +31,6 @@ from saccade.shared.world.geometry import (
     rotation_towards,
     unit,
     viewing_grid,
-    wrap,
 )
 from saccade.shared.world.task import LOWER_M, UPPER_M, Spheres, clip, spheres_around, success
 
@@ -53,19 +53,17 @@ VISITED_RAD = 0.35  # chosen: viewpoints within about this angle of one that was
 VISITED_COST = 6.0  # chosen: nats that are added to the cost of a viewpoint that was not the goal's
 DOUBT_LIMIT = 2.5  # chosen: after wrong viewpoints the goal's log posterior is divided by at most this
 SURE = 0.6  # chosen: the agent says that it is at the goal's view if the probability of this is higher
-PEAK_ROWS = 2  # chosen: the posterior's peak is averaged over this many cells of elevation on each side
-PEAK_COLUMNS = 4  # chosen: the posterior's peak is averaged over this many cells of azimuth on each side
 PUBLISHED = 64  # number of candidates in a plan message; it changes nothing that the agent does
 
 
 class Planner:
     """Turns beliefs into plans and actions.
 
-    Raises SaccadeError if the weights are missing or damaged, or if they lack an object.
+    Raises SaccadeError if the weights are missing or damaged, if they lack an object, or if a card is damaged.
     """
 
     def __init__(self, config: Config, names: tuple[str, ...]):
-        self.config, self.names = config, names
+        self.config, self.names, self.symmetry = config, names, symmetries(config.scene.objects, names)
         self.moved_by_others = config.camera.source is not None
         self.sizes_m = {card.name: card.size_m for card in Weights(config.weights).cards_of(names)}
 
@@ -108,7 +106,7 @@ class Planner:
         translation, rotation = step_towards(camera, heading, spheres, self.config.planner.step_m)
         if declared:  # the agent is judged at the pose at which it says that it has arrived, so it must not move
             translation, rotation = np.zeros(3), np.zeros(3)
-        plan = self._published(chosen, stamp, camera, beliefs, declared)
+        plan = self._published(chosen, stamp, camera, beliefs, spheres, declared)
         yield Output(PLAN, plan)
         yield Output(ACTION, Action(run=plan.run, episode=plan.episode, step=plan.step, translation_m=translation,
                                     rotation_rad=rotation, arrived=declared))
@@ -161,15 +159,16 @@ class Planner:
         rng = generator(self.config.seed, self.config.bus.world, self.episode, stamp.step, "planner")
         found, best = self.preference if mode != "search" else None, None
         eyes, gazes = self._candidates(beliefs, rng)
-        if found is not None and (log_posterior := beliefs[found.target].goal_log_posterior) is not None:
+        if found is not None and beliefs[found.target].goal_log_posterior is not None:
             target = beliefs[found.target]
-            best = self._goal_viewpoint(found, target, _peak(target.mean_m, log_posterior, found.range_m))
-            eyes, gazes = np.vstack([eyes, best[:3, 3]]), np.vstack([gazes, target.mean_m])
+            eye = peak_eye(target, found.range_m, self.symmetry[target.object], camera, spheres)
+            best, side = self._goal_viewpoint(found, target, eye), self._side(target, eye)
+            eyes, gazes = np.vstack([side.eyes(eyes), best[:3, 3]]), np.vstack([gazes, target.mean_m])
         eyes = np.clip(eyes, LOWER_M, UPPER_M)
         terms = expected_free_energy(eyes, gazes, beliefs, found, self.config.planner.information_weight)
         if found is not None:  # after each wrong viewpoint, pose and scale are trusted less, so others are tried
             cost = (terms.pose + terms.scale) / self._doubt + terms.position + terms.information
-            cost = cost + self._visited_cost(eyes, beliefs[found.target].mean_m)
+            cost = cost + self._visited_cost(eyes, self._side(beliefs[found.target], eyes[-1]))
         else:  # of equally informative viewpoints the nearest is taken
             cost = terms.total + NEARER * np.linalg.norm(eyes - camera[:3, 3], axis=1)
         chosen = int(np.argmin(cost))
@@ -220,13 +219,16 @@ class Planner:
             eyes[:third] = gazes[:third] + reach[:, None] * away
         return eyes, gazes
 
-    def _visited_cost(self, eyes: Array, center: Array) -> Array:
-        """Cost [N] (nats) of views from `eyes` [N, 3] of `center` [3] that are like views that were not the goal's."""
+    def _side(self, target: Belief, eye: Array) -> Side:
+        return Side(target.mean_m, self.symmetry[target.object], eye)
+
+    def _visited_cost(self, eyes: Array, side: Side) -> Array:
+        """Cost [N] (nats) of views of the target from `eyes` [N, 3] that are like views that were not the goal's."""
         cost = np.zeros(len(eyes))
         if not self.visited:
             return cost
-        rotations = rotation_towards(center - eyes)
-        for seen in self.visited:
+        rotations = rotation_towards(side.center - eyes)
+        for seen in map(side.pose, self.visited):
             far = ((eyes - seen[:3, 3]) ** 2).sum(1) / VISITED_M ** 2
             turned = (rotation_angle(rotations, seen[:3, :3]) / VISITED_RAD) ** 2
             cost += VISITED_COST * np.exp(-0.5 * (far + turned))
@@ -251,31 +253,14 @@ class Planner:
             goal_confidence=self.confidence,
             arrived=False)
 
-    def _published(self, plan: Plan, stamp: Belief, camera: Array, beliefs: dict[str, Belief], declared: bool) -> Plan:
+    def _published(self, plan: Plan, stamp: Belief, camera: Array, beliefs: dict[str, Belief], spheres: Spheres,
+                   declared: bool) -> Plan:
         """The chosen plan with the step, the distance to the goal and the declaration of the present step."""
         distance, target = -1.0, beliefs.get(plan.target)
         if self.preference is not None and target is not None and target.goal_log_posterior is not None:
-            eye = _peak(target.mean_m, target.goal_log_posterior, self.preference.range_m)
+            eye = peak_eye(target, self.preference.range_m, self.symmetry[target.object], camera, spheres)
             distance = float(np.linalg.norm(eye - camera[:3, 3]))
         return replace(plan, step=stamp.step, believed_distance_m=distance, arrived=declared)
-
-
-def _peak(center: Array, log_posterior: NDArray[np.float32], range_m: float) -> Array:
-    """The camera position [3] at the goal's range in the direction of the posterior's peak.
-
-    The peak is averaged over its neighbours in the grid. Azimuth and elevation are averaged separately, because near
-    the pole two positions may be neighbours although their images are rotated by half a turn.
-    """
-    elevation, azimuth = viewing_grid()
-    fine = log_posterior.astype(np.float64)
-    row, column = map(int, np.unravel_index(np.argmax(fine), fine.shape))
-    rows = np.arange(max(row - PEAK_ROWS, 0), min(row + PEAK_ROWS + 1, len(elevation)))
-    columns = np.arange(column - PEAK_COLUMNS, column + PEAK_COLUMNS + 1) % len(azimuth)
-    mass = np.exp(fine[np.ix_(rows, columns)] - fine[row, column])
-    mass /= mass.sum()
-    mean_azimuth = azimuth[column] + (mass * wrap(azimuth[columns] - azimuth[column])).sum()
-    mean_elevation = (mass * elevation[rows][:, None]).sum()
-    return center + range_m * direction(mean_azimuth, mean_elevation)
 
 
 def _between(a: Array, b: Array) -> tuple[float, float]:
