@@ -10,13 +10,11 @@ from PIL import Image
 
 from saccade.app.cli.texts import configured, is_list
 from saccade.app.objects.adding import add_meshes, learn_set, remove_objects
+from saccade.app.objects.cards import TURNTABLE, Card
 from saccade.app.objects.learning import likeness
 from saccade.app.objects.lists import assembled, members_of
 from saccade.app.objects.showing import list_set, show_object
 from saccade.app.objects.store import (
-    CARD,
-    TURNTABLE,
-    Card,
     alone_in,
     keep,
     name_from,
@@ -28,6 +26,7 @@ from saccade.shared.config import WEIGHTS, Config, SceneConfig, learned_folder, 
 from saccade.shared.errors import SaccadeError
 from saccade.shared.files import parse_toml
 from saccade.shared.model.bank import bank_of
+from saccade.shared.model.object_card import CARD
 from saccade.shared.model.weights import MANIFEST, OPEN, Weights, weights_in_use
 from saccade.shared.render.groceries import grocery
 from saccade.shared.render.mesh import read_obj
@@ -235,7 +234,7 @@ def test_who_says_no_adds_nothing(home, console, tmp_path):
                ask=lambda question: bool(asked.append(question)), console=console)
     assert asked == ["Is cup right?"]
     assert not (home / "my" / "cup").exists()
-    assert "cup is not added: --unit and --up say how the file is meant" in console.export_text()
+    assert "cup is not added: --unit, --up and --symmetry say how the file is meant" in console.export_text()
 
 
 def test_a_set_is_listed_and_an_object_is_shown(home, console):

@@ -6,11 +6,12 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from saccade.app.objects.learning import digest, digests_of, likeness
-from saccade.app.objects.store import CARD, TURNTABLE
+from saccade.app.objects.cards import TURNTABLE, digest
+from saccade.app.objects.learning import digests_of, likeness
 from saccade.app.run.display import say
 from saccade.shared.config import learned_folder, set_folder
 from saccade.shared.errors import LINE_LIMIT, SaccadeError, printable, told
+from saccade.shared.model.object_card import CARD
 from saccade.shared.model.weights import OPEN, Weights
 from saccade.shared.render.objects import load_mesh, names_of
 

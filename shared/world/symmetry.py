@@ -48,7 +48,7 @@ def turns_of(symmetry: int, steps: int = STEPS) -> Array:
     """The turns (rad) about the up axis after which an object looks the same [N], the first of which is 0. For a
     continuous symmetry they are `steps` turns."""
     count = steps if symmetry == CONTINUOUS else symmetry
-    return 2 * np.pi / count * np.arange(count)
+    return np.asarray(2 * np.pi / count * np.arange(count, dtype=np.float64))
 
 
 def about_vertical(turns: ArrayLike) -> Array:
