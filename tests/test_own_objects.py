@@ -267,7 +267,8 @@ def test_listed_objects_of_several_sets_are_one_set(home, tmp_path, monkeypatch)
     assert assembled("pantry:soup_can, tea,other:oil", OPEN) == folder
     assert {path.name: path.stat().st_mtime_ns for path in Path(folder).iterdir()}.items() >= {
         name: when for name, when in before.items() if not name.startswith("weights")}.items()
-    config = configured(None, {"scene.objects": "tea,oil"}, None, "still")
+    config, agent = configured(None, {"scene.objects": "tea,oil"}, None, "still")
+    assert agent == "still"
     assert names_of(config.scene.objects) == ("oil", "tea")
 
 
