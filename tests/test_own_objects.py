@@ -11,8 +11,8 @@ from PIL import Image
 from saccade.app.cli.texts import configured, is_list
 from saccade.app.objects.adding import add_meshes, learn_set, remove_objects
 from saccade.app.objects.cards import TURNTABLE, Card
-from saccade.app.objects.learning import likeness
 from saccade.app.objects.lists import assembled, members_of
+from saccade.app.objects.page import own_likeness, pairs_of
 from saccade.app.objects.showing import list_set, show_object
 from saccade.app.objects.store import (
     alone_in,
@@ -25,7 +25,7 @@ from saccade.app.objects.store import (
 from saccade.shared.config import WEIGHTS, Config, SceneConfig, learned_folder, set_folder
 from saccade.shared.errors import SaccadeError
 from saccade.shared.files import parse_toml
-from saccade.shared.model.bank import bank_of
+from saccade.shared.model.bank import bank_in, bank_of
 from saccade.shared.model.object_card import CARD
 from saccade.shared.model.weights import MANIFEST, OPEN, Weights, weights_in_use
 from saccade.shared.render.groceries import grocery
@@ -136,9 +136,10 @@ def test_what_is_added_is_learnt_and_leaves_the_others_as_they_were(home, consol
     assert weights.networks.folder == WEIGHTS / OPEN
     assert len(bank_of("oil", weights.bank("oil")).pictures) > 100
     assert (folder / "oil.bank.safetensors").stat().st_size < 600_000
-    names, alike = likeness("my")
-    assert np.diag(alike) == pytest.approx(1.0, abs=0.01)
-    assert alike[names.index("tea"), names.index("oil")] < 0.95
+    banks = {name: bank_in(weights, name) for name in weights.names}
+    alike = {pair.other: pair.similar for pair in pairs_of("tea", banks)}
+    assert set(alike) == {"rice", "oil"}
+    assert 0.0 < max(alike.values()) < own_likeness(banks["tea"]) < 1.0
     text = console.export_text()
     assert "learnt rice, tea: 2 objects in" in text
     assert "learnt oil: 3 objects in" in text

@@ -55,13 +55,15 @@ def list_objects(*, objects: Set = "my") -> None:
 
 
 @app.command()
-def show(name: Annotated[str, NAME], *, objects: Set = "my") -> None:
-    """Show an object: its size, its picture, and which others of the set look most like it."""
+def show(name: Annotated[str, NAME], *, objects: Set = "my",
+         out: Annotated[Path | None, typer.Option(
+             help="Also write a page about it (NAME.md) with pictures.", metavar="FOLDER")] = None) -> None:
+    """Show an object: its size, its symmetry, its picture, and which others of the set look most like it."""
     from rich.console import Console
 
     from saccade.app.objects.showing import show_object
 
-    show_object(objects, name, Console())
+    show_object(objects, name, Console(), out)
 
 
 @app.command()

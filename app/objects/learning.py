@@ -125,11 +125,3 @@ def _forget(target: Path, cards: dict[str, ObjectCard]) -> None:
         for path in target.glob(bank_file("*")):
             if path.name not in kept:
                 path.unlink()
-
-
-def likeness(objects: str) -> tuple[tuple[str, ...], NDArray[np.float64]]:
-    """How alike the objects of a set look: for each pair the largest similarity of two views [K, K], 1 being the same.
-    Raises SaccadeError if the set was not learnt."""
-    weights = Weights(learned_folder(objects, OPEN))
-    vectors = [weights.bank(name)["vectors"].astype(np.float64) for name in weights.names]
-    return weights.names, np.array([[float((a @ b.T).max()) for b in vectors] for a in vectors])

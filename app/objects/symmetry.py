@@ -23,14 +23,14 @@ from saccade.shared.world.windows import CROP_PX
 DIAGONAL_M = 0.5  # to which an object is scaled, so that it is well between the near and the far plane
 HALF_ANGLE = 0.35  # the tangent of half the angle that the object covers
 SAMPLES = 2  # in a pixel, along each side
-ELEVATIONS_RAD = (0.15, 0.7, 1.2)
-STARTS = 24  # views from around that are compared with turned ones
+ELEVATIONS_RAD = (0.15, 1.0)
+STARTS = 12  # views from around that are compared with turned ones
 GRID_PX = 0.5  # how far the grid of pixels is moved to measure what resampling changes: farther is the next pixel
 NEIGHBOURS_PX = 5  # chosen: a pixel is compared with the square of this side in the turned view
 TOGETHER_PX = 3  # chosen: differences are averaged over squares of this side: grain goes, and what has a shape stays
 # Chosen: what counts as different in the largest of the colours' three channels, in the outline and in the relief; the
 # last one is in diagonals of the object.
-DIFFERENT = {"colour": 0.06, "outline": 0.1, "relief": 0.04}
+DIFFERENT = {"colour": 0.06, "outline": 0.1, "relief": 0.015}
 CHANNELS = {"colour": slice(0, 3), "outline": slice(3, 4), "relief": slice(4, 5)}
 # Chosen: the share of the outline that may differ beyond what resampling changes, which counts up to the same share. Of
 # 23 scanned objects, turned views of those without symmetry differ in 18 % or more, of those with one in 4 % or less.
