@@ -183,7 +183,7 @@ def test_meshes_are_added_and_learnt_and_a_bad_one_does_not_stop_the_others(home
     assert Weights(learned_folder("my", OPEN)).names == ("tea",)
     text = console.export_text()
     assert "its picture is" in text
-    assert "use it with `--agent open --objects my`" in text
+    assert "use it with `--objects my`" in text
 
 
 @pytest.mark.parametrize("damage", ["bank", "manifest", "hashes", "gone"])

@@ -37,17 +37,17 @@ def grain():
 
 
 @pytest.mark.parametrize(("mesh", "expected"), [
-    (can(), CONTINUOUS), (can(grain()), CONTINUOUS), (can(labelled(0.3)), NONE), (can(labelled(0.1, 0.6)), 2),
+    (can(grain()), CONTINUOUS), (can(labelled(0.3)), NONE), (can(labelled(0.1, 0.6)), 2),
     (can(sides=6), 6), (box((0.08, 0.08, 0.14)), 4), (box((0.08, 0.08, 0.14), labelled(0.05)), NONE), (mug(), NONE),
-], ids=["can", "grain", "label", "two labels", "six sides", "square", "labelled box", "mug"])
+], ids=["grain", "label", "two labels", "six sides", "square", "labelled box", "mug"])
 def test_the_symmetry_of_an_object_is_found_by_looking_at_it_from_around(mesh, expected):
     assert symmetry_of(mesh) == expected
 
 
 @pytest.mark.parametrize("scale", [0.1, 30.0])
 def test_it_is_found_whatever_the_size(scale):
-    """Of a thimble and of a barrel, which the camera could not see from where it usually is."""
-    assert symmetry_of(box((0.05 * scale, 0.08 * scale, 0.14 * scale))) == 2
+    """Of a thimble and of a barrel. If the camera did not see the label, they would look the same from all around."""
+    assert symmetry_of(can(labelled(0.3), radius_m=0.035 * scale, height_m=0.11 * scale)) == NONE
 
 
 @pytest.mark.parametrize(("said", "symmetry"), [("none", NONE), ("continuous", CONTINUOUS), (4, 4), ("4", 4)])

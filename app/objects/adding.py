@@ -72,7 +72,7 @@ def _add(folder: Path, path: Path, imported: Imported, ask: Ask | None, console:
         say(console, f"{mesh.name}: {note}")
     size = " x ".join(f"{100 * side:.1f}" for side in mesh.size_m)
     card = Card(str(path), imported.unit, imported.up, imported.notes, symmetry=known, symmetry_found=found)
-    say(console, f"{mesh.name}: turned about the vertical it has {symmetry_words(known)}")
+    say(console, f"{mesh.name}: turned about the vertical, it {symmetry_words(known)}")
     if ask is None:
         say(console, f"{mesh.name}: {size} cm; its picture is {keep(folder, mesh, card, picture) / TURNTABLE}")
         return True
@@ -112,7 +112,7 @@ def _learn(objects: str, folder: Path, console: Console) -> None:
     wrong = _refreshed(folder, [name for name in names_of(objects) if name not in done.refused], console)
     say(console, f"learnt {', '.join(done.names) or 'nothing new'}: {known} object{'s' * (known != 1)} in {folder}")
     if known:
-        say(console, f"use {'it' if known == 1 else 'them'} with `--agent open --objects {objects}`")
+        say(console, f"use {'it' if known == 1 else 'them'} with `--objects {objects}`")
     if done.refused:
         raise SaccadeError(f"{len(done.refused)} of the set's objects could not be learnt: see above")
     if wrong:

@@ -90,9 +90,9 @@ def refresh(folder: Path, tell: Callable[[str], None]) -> None:
         values = {"name": folder.name} | values
     with writing(folder, "object"):
         replace_all(folder, {CARD: _with(folder / CARD, values).encode(), TURNTABLE: png(turntable(mesh))})
-    tell(f"{folder.name}: its card and its picture are new; by its views it has {symmetry_words(found)}" if is_found
-         else f"{folder.name}: its card and its picture are new; by its views it has {symmetry_words(found)}, and its "
-              f"card keeps {symmetry_words(said)}, which you have set")
+    kept = "" if is_found else f"; its card keeps the symmetry that you have set, {symmetry_value(said)}"
+    tell(f"{folder.name}: its card and its picture are new; turned about the vertical, it "
+         f"{symmetry_words(found)}{kept}")
 
 
 def _with(path: Path, values: Mapping[str, Any]) -> str:

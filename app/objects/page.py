@@ -27,8 +27,8 @@ TOLD = ("source", "unit", "up", "licence")  # keys of the card
 
 @dataclass(frozen=True)
 class Pair:
-    """Two views, of an object and of another one, which are the most alike of all; their similarity is 1 if they are
-    the same."""
+    """Two views from above, of an object and of another one, which are the most alike of all; their similarity is 1 if
+    they are the same."""
 
     similar: float
     other: str
@@ -51,7 +51,7 @@ def own_likeness(bank: Bank) -> float:
     """How alike neighbouring views of one object are: the median of each view's largest similarity to another one."""
     similar = _similar(bank, bank)
     np.fill_diagonal(similar, -1.0)
-    return float(np.median(similar.max(1)))
+    return float(np.median(similar.max(1)[bank.directions[:, 2] > 0.0]))
 
 
 def write_page(objects: str, name: str, out: Path, *, is_learnt: bool) -> Path:
@@ -103,7 +103,7 @@ def _likeness(name: str, banks: dict[str, Bank], files: dict[str, bytes]) -> lis
                   f"{'as alike as its own views' if pair.similar >= own else 'less alike than its own views'}.", "",
                   f"    ![{name} and {pair.other}]({picture})", ""]
     shown = [name, *(pair.other for pair in pairs[:IN_MATRIX - 1])]
-    lines += ["The largest similarity of two views:", "", "| | " + " | ".join(shown) + " |",
+    lines += ["The largest similarity of two views from above:", "", "| | " + " | ".join(shown) + " |",
               "| --- |" + " ---: |" * len(shown)]
     for one in shown:
         cells = (own_likeness(banks[one]) if one == two else float(_similar(banks[one], banks[two]).max())
@@ -115,7 +115,9 @@ def _likeness(name: str, banks: dict[str, Bank], files: dict[str, bytes]) -> lis
 
 
 def _similar(one: Bank, other: Bank) -> NDArray[np.float64]:
-    return one.vectors.astype(np.float64) @ other.vectors.astype(np.float64).T
+    """The similarities of the views of two banks [V, W]. Views from below count as unlike: objects stand."""
+    above = [np.where(bank.directions[:, 2:] > 0.0, bank.vectors.astype(np.float64), 0.0) for bank in (one, other)]
+    return np.asarray(above[0] @ above[1].T)
 
 
 def _views(bank: Bank) -> NDArray[np.uint8]:

@@ -39,9 +39,10 @@ def symmetry_value(symmetry: int) -> str | int:
 
 
 def symmetry_words(symmetry: int) -> str:
-    """A symmetry in words."""
-    return {NONE: "no symmetry", CONTINUOUS: "the same from all around"}.get(
-        symmetry, f"the same after each {'half' if symmetry == 2 else f'1/{symmetry}'} turn")
+    """How an object looks when it is turned about the vertical, in words."""
+    part = {2: "half a turn", 3: "a third of a turn", 4: "a quarter turn"}.get(symmetry, f"1/{symmetry} of a turn")
+    return {NONE: "looks different from each side", CONTINUOUS: "looks the same from all around"}.get(
+        symmetry, f"looks the same after {part}")
 
 
 def turns_of(symmetry: int, steps: int = STEPS) -> Array:
