@@ -8,11 +8,10 @@ import pytest
 from saccade.app.objects.symmetry import symmetry_of
 from saccade.services.belief.turn import TURNS, turn_probability
 from saccade.services.evaluator.core import result_of
-from saccade.services.planner.goal_views import Side, peak_eye
+from saccade.services.planner.goal_views import Side, nearest_eye
 from saccade.services.planner.oracle import Oracle
 from saccade.services.simulator.core import Simulator
 from saccade.services.simulator.scenes import Placed, Scene
-from saccade.shared.bus.messages import Belief
 from saccade.shared.errors import SaccadeError
 from saccade.shared.model.object_card import CARD, symmetries, symmetry_in
 from saccade.shared.world.geometry import direction, look_at, spherical, viewing_grid, wrap
@@ -24,7 +23,7 @@ from saccade.shared.world.symmetry import (
     turned_about,
     turns_of,
 )
-from saccade.shared.world.task import Episode, Spheres, equal_goals, nearest_goal, spheres_around, start_pose, success
+from saccade.shared.world.task import Episode, Spheres, equal_goals, nearest_goal, spheres_around, success
 from saccade.tests.fakes.shapes import TEXTURE_PX, box, can, labelled, mug
 from saccade.tests.test_turn import CENTER, TURN, camera_at, goal_view, seen
 
@@ -190,26 +189,15 @@ def test_the_belief_shows_all_views_that_look_like_the_goal_and_knows_when_it_is
 
 # --- plans
 
-def believed(azimuth, elevation=0.6):
-    """The belief in an object whose goal's direction is known."""
-    rows, columns = viewing_grid()
-    aside = wrap(columns - azimuth)[None] ** 2 + (rows - elevation)[:, None] ** 2
-    log_posterior = (-0.5 * aside / 0.1 ** 2).astype(np.float32)
-    return Belief(run="r", episode=0, step=0, object="can", presence=1.0, world_from_camera=start_pose(), mean_m=CENTER,
-                  covariance_m2=np.eye(3) * 1e-6, particles_m=np.zeros((1, 3), np.float32), views=1,
-                  goal_log_posterior=log_posterior)
-
-
 def test_the_agent_goes_to_the_nearest_view_that_looks_like_the_goal_and_is_free():
-    belief, camera = believed(np.pi * 0.9), camera_at(0.0)
-    there = CENTER + 0.3 * direction(np.pi * 0.9, 0.6)
-    assert peak_eye(belief, 0.3, NONE, camera, NOTHING) == pytest.approx(there, abs=0.01)
+    there, camera = CENTER + 0.3 * direction(np.pi * 0.9, 0.6), camera_at(0.0)
+    assert nearest_eye(there, CENTER, NONE, camera, NOTHING) is there
     near = CENTER + 0.3 * direction(-np.pi * 0.1, 0.6)
-    assert peak_eye(belief, 0.3, 2, camera, NOTHING) == pytest.approx(near, abs=0.01)
-    assert peak_eye(belief, 0.3, CONTINUOUS, camera, NOTHING) == pytest.approx(
+    assert nearest_eye(there, CENTER, 2, camera, NOTHING) == pytest.approx(near)
+    assert nearest_eye(there, CENTER, CONTINUOUS, camera, NOTHING) == pytest.approx(
         CENTER + 0.3 * direction(0.0, 0.6), abs=0.01)
     blocking = Spheres(near[None], np.array([0.12]))
-    assert peak_eye(belief, 0.3, 2, camera, blocking) == pytest.approx(there, abs=0.01)
+    assert nearest_eye(there, CENTER, 2, camera, blocking) == pytest.approx(there)
 
 
 @pytest.mark.parametrize(("symmetry", "most"), [(2, np.pi / 2), (4, np.pi / 4), (CONTINUOUS, 0.0)])

@@ -11,10 +11,11 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from saccade.services.planner.free_energy import Terms, expected_free_energy
 from saccade.services.planner.goal import Preference, aim, infer_preference
-from saccade.services.planner.goal_views import Side, peak_eye
+from saccade.services.planner.goal_views import Side, nearest_eye
 from saccade.services.planner.motion import step_towards
 from saccade.shared.bus.messages import Action, Belief, Plan
 from saccade.shared.bus.topics import ACTION, BELIEF, GOAL_PERCEPT, PLAN, Output
@@ -31,6 +32,7 @@ from saccade.shared.world.geometry import (
     rotation_towards,
     unit,
     viewing_grid,
+    wrap,
 )
 from saccade.shared.world.task import LOWER_M, UPPER_M, Spheres, clip, spheres_around, success
 
@@ -53,6 +55,8 @@ VISITED_RAD = 0.35  # chosen: viewpoints within about this angle of one that was
 VISITED_COST = 6.0  # chosen: nats that are added to the cost of a viewpoint that was not the goal's
 DOUBT_LIMIT = 2.5  # chosen: after wrong viewpoints the goal's log posterior is divided by at most this
 SURE = 0.6  # chosen: the agent says that it is at the goal's view if the probability of this is higher
+PEAK_ROWS = 2  # chosen: the posterior's peak is averaged over this many cells of elevation on each side
+PEAK_COLUMNS = 4  # chosen: the posterior's peak is averaged over this many cells of azimuth on each side
 PUBLISHED = 64  # number of candidates in a plan message; it changes nothing that the agent does
 
 
@@ -159,9 +163,9 @@ class Planner:
         rng = generator(self.config.seed, self.config.bus.world, self.episode, stamp.step, "planner")
         found, best = self.preference if mode != "search" else None, None
         eyes, gazes = self._candidates(beliefs, rng)
-        if found is not None and beliefs[found.target].goal_log_posterior is not None:
+        if found is not None and (log_posterior := beliefs[found.target].goal_log_posterior) is not None:
             target = beliefs[found.target]
-            eye = peak_eye(target, found.range_m, self.symmetry[target.object], camera, spheres)
+            eye = self._goal_eye(target, log_posterior, found.range_m, camera, spheres)
             best, side = self._goal_viewpoint(found, target, eye), self._side(target, eye)
             eyes, gazes = np.vstack([side.eyes(eyes), best[:3, 3]]), np.vstack([gazes, target.mean_m])
         eyes = np.clip(eyes, LOWER_M, UPPER_M)
@@ -234,6 +238,11 @@ class Planner:
             cost += VISITED_COST * np.exp(-0.5 * (far + turned))
         return cost
 
+    def _goal_eye(self, target: Belief, log_posterior: NDArray[np.float32], range_m: float, camera: Array,
+                  spheres: Spheres) -> Array:
+        eye = _peak(target.mean_m, log_posterior, range_m)
+        return nearest_eye(eye, target.mean_m, self.symmetry[target.object], camera, spheres)
+
     def _goal_viewpoint(self, preference: Preference, target: Belief, eye: Array) -> Array:
         """The camera pose [4, 4] at `eye` [3] that shows the target at the pixel where the goal image shows it.
 
@@ -258,9 +267,27 @@ class Planner:
         """The chosen plan with the step, the distance to the goal and the declaration of the present step."""
         distance, target = -1.0, beliefs.get(plan.target)
         if self.preference is not None and target is not None and target.goal_log_posterior is not None:
-            eye = peak_eye(target, self.preference.range_m, self.symmetry[target.object], camera, spheres)
+            eye = self._goal_eye(target, target.goal_log_posterior, self.preference.range_m, camera, spheres)
             distance = float(np.linalg.norm(eye - camera[:3, 3]))
         return replace(plan, step=stamp.step, believed_distance_m=distance, arrived=declared)
+
+
+def _peak(center: Array, log_posterior: NDArray[np.float32], range_m: float) -> Array:
+    """The camera position [3] at the goal's range in the direction of the posterior's peak.
+
+    The peak is averaged over its neighbours in the grid. Azimuth and elevation are averaged separately, because near
+    the pole two positions may be neighbours although their images are rotated by half a turn.
+    """
+    elevation, azimuth = viewing_grid()
+    fine = log_posterior.astype(np.float64)
+    row, column = map(int, np.unravel_index(np.argmax(fine), fine.shape))
+    rows = np.arange(max(row - PEAK_ROWS, 0), min(row + PEAK_ROWS + 1, len(elevation)))
+    columns = np.arange(column - PEAK_COLUMNS, column + PEAK_COLUMNS + 1) % len(azimuth)
+    mass = np.exp(fine[np.ix_(rows, columns)] - fine[row, column])
+    mass /= mass.sum()
+    mean_azimuth = azimuth[column] + (mass * wrap(azimuth[columns] - azimuth[column])).sum()
+    mean_elevation = (mass * elevation[rows][:, None]).sum()
+    return center + range_m * direction(mean_azimuth, mean_elevation)
 
 
 def _between(a: Array, b: Array) -> tuple[float, float]:
