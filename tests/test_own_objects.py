@@ -10,13 +10,11 @@ from PIL import Image
 
 from saccade.app.cli.texts import configured, is_list
 from saccade.app.objects.adding import add_meshes, learn_set, remove_objects
-from saccade.app.objects.learning import likeness
+from saccade.app.objects.cards import TURNTABLE, Card
 from saccade.app.objects.lists import assembled, members_of
+from saccade.app.objects.page import own_likeness, pairs_of
 from saccade.app.objects.showing import list_set, show_object
 from saccade.app.objects.store import (
-    CARD,
-    TURNTABLE,
-    Card,
     alone_in,
     keep,
     name_from,
@@ -27,7 +25,8 @@ from saccade.app.objects.store import (
 from saccade.shared.config import WEIGHTS, Config, SceneConfig, learned_folder, set_folder
 from saccade.shared.errors import SaccadeError
 from saccade.shared.files import parse_toml
-from saccade.shared.model.bank import bank_of
+from saccade.shared.model.bank import bank_in, bank_of
+from saccade.shared.model.object_card import CARD
 from saccade.shared.model.weights import MANIFEST, OPEN, Weights, weights_in_use
 from saccade.shared.render.groceries import grocery
 from saccade.shared.render.mesh import read_obj
@@ -137,9 +136,10 @@ def test_what_is_added_is_learnt_and_leaves_the_others_as_they_were(home, consol
     assert weights.networks.folder == WEIGHTS / OPEN
     assert len(bank_of("oil", weights.bank("oil")).pictures) > 100
     assert (folder / "oil.bank.safetensors").stat().st_size < 600_000
-    names, alike = likeness("my")
-    assert np.diag(alike) == pytest.approx(1.0, abs=0.01)
-    assert alike[names.index("tea"), names.index("oil")] < 0.95
+    banks = {name: bank_in(weights, name) for name in weights.names}
+    alike = {pair.other: pair.similar for pair in pairs_of("tea", banks)}
+    assert set(alike) == {"rice", "oil"}
+    assert 0.0 < max(alike.values()) < own_likeness(banks["tea"]) < 1.0
     text = console.export_text()
     assert "learnt rice, tea: 2 objects in" in text
     assert "learnt oil: 3 objects in" in text
@@ -183,7 +183,7 @@ def test_meshes_are_added_and_learnt_and_a_bad_one_does_not_stop_the_others(home
     assert Weights(learned_folder("my", OPEN)).names == ("tea",)
     text = console.export_text()
     assert "its picture is" in text
-    assert "use it with `--agent open --objects my`" in text
+    assert "use it with `--objects my`" in text
 
 
 @pytest.mark.parametrize("damage", ["bank", "manifest", "hashes", "gone"])
@@ -235,7 +235,7 @@ def test_who_says_no_adds_nothing(home, console, tmp_path):
                ask=lambda question: bool(asked.append(question)), console=console)
     assert asked == ["Is cup right?"]
     assert not (home / "my" / "cup").exists()
-    assert "cup is not added: --unit and --up say how the file is meant" in console.export_text()
+    assert "cup is not added: --unit, --up and --symmetry say how the file is meant" in console.export_text()
 
 
 def test_a_set_is_listed_and_an_object_is_shown(home, console):
@@ -268,7 +268,8 @@ def test_listed_objects_of_several_sets_are_one_set(home, tmp_path, monkeypatch)
     assert assembled("pantry:soup_can, tea,other:oil", OPEN) == folder
     assert {path.name: path.stat().st_mtime_ns for path in Path(folder).iterdir()}.items() >= {
         name: when for name, when in before.items() if not name.startswith("weights")}.items()
-    config = configured(None, {"scene.objects": "tea,oil"}, None, "still")
+    config, agent = configured(None, {"scene.objects": "tea,oil"}, None, "still")
+    assert agent == "still"
     assert names_of(config.scene.objects) == ("oil", "tea")
 
 

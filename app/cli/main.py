@@ -13,6 +13,7 @@ from saccade.app.cli import bench, log, look, objects, poses, replay, run, train
 from saccade.app.cli.front import FrontDoor, command_of
 from saccade.app.run.threads import prefer_one_thread
 from saccade.shared.errors import LINE_LIMIT, SaccadeError, printable
+from saccade.shared.files import remedy
 
 EXIT_ERROR, EXIT_INTERRUPTED = 2, 130
 MENDABLE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO, errno.ENAMETOOLONG,
@@ -66,7 +67,7 @@ def main() -> None:
         if error.errno not in MENDABLE:
             raise
         where = f"{error.filename}: " if error.filename else ""
-        told = printable(f"{where}{error.strerror}: free some space, or name another place", LINE_LIMIT)
+        told = printable(f"{where}{error.strerror}: {remedy(error)}", LINE_LIMIT)
         print(f"saccade: {told}", file=sys.stderr)
         sys.exit(EXIT_ERROR)
     except SystemExit as error:

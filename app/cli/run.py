@@ -8,7 +8,18 @@ from typing import Annotated, Literal
 
 import typer
 
-from saccade.app.cli.options import AGENTS, ConfigFile, Names, Objects, ScenesFile, Seed, Values, WeightsFolder, Yaw
+from saccade.app.cli.options import (
+    AGENT_DEFAULT,
+    AGENTS,
+    ConfigFile,
+    Names,
+    Objects,
+    ScenesFile,
+    Seed,
+    Values,
+    WeightsFolder,
+    Yaw,
+)
 from saccade.app.cli.texts import configured, numbers, split_names
 from saccade.shared.errors import SaccadeError
 
@@ -34,7 +45,8 @@ def run(*, objects: Objects = None, names: Names = None, scenes: ScenesFile = No
         bus: Annotated[Literal["zenoh", "local"] | None, typer.Option(
             help="Run each service as a process on a Zenoh bus, or all within this "
                  "process.", show_default="zenoh")] = None,
-        agent: Annotated[str, typer.Option(help=f"Which agent to run: {AGENTS}.")] = "sceneccn",
+        agent: Annotated[str | None, typer.Option(
+            help=f"Which agent to run: {AGENTS}.", show_default=AGENT_DEFAULT)] = None,
         weights: WeightsFolder = None,
         world: Annotated[str, typer.Option(
             help="Where images come from: simulator, or camera for a real one.")] = "simulator",
@@ -81,7 +93,8 @@ def run(*, objects: Objects = None, names: Names = None, scenes: ScenesFile = No
             say(console, f"to be seen at {url_of(finished.config.viewer)} until Ctrl-C")
             stay(finished.is_viewed)
 
-    finished = run_agent(configured(config, given, values, agent), agent=agent, out=out, plain=plain, console=console,
-                         world=world, view=view, after=show)
+    resolved, agent = configured(config, given, values, agent)
+    finished = run_agent(resolved, agent=agent, out=out, plain=plain, console=console, world=world, view=view,
+                         after=show)
     if finished.lacks:  # it was said when it happened
         raise typer.Exit(2)
