@@ -25,7 +25,7 @@ MARGIN_M = 0.01  # which many printers leave white
 FOOT_M = 0.024  # for the ruler and the words
 MARKER_SHARE = 0.76  # of a square's side
 LARGEST_ERROR = 0.1  # of a measured ruler; a larger one is a mistake
-TICK_M, FONT_PT, TITLE_PT = 0.003, 7.5, 9.0
+TICK_M, FONT_PT, TITLE_PT = 0.003, 7.0, 9.0
 
 
 @dataclass(frozen=True)
@@ -55,8 +55,8 @@ def board_for(paper: Paper, square_m: float | None, *, free_middle: bool) -> Boa
         return Board(squares=(columns, rows), square_m=side, marker_m=round(MARKER_SHARE * side, 4),
                      dictionary="4X4_100" if columns * rows <= 200 else "4X4_250", free_middle=free_middle)
     except ValueError as error:
-        raise SaccadeError(f"--square-mm {1e3 * side:g}: {columns}x{rows} squares are more than a board has: give larger "
-                           "squares") from error
+        raise SaccadeError(f"--square-mm {1e3 * side:g}: {columns}x{rows} squares are more than a board has: give "
+                           "larger squares") from error
 
 
 def as_printed(board: Board, paper: Paper, measured_m: float | None) -> Board:
@@ -102,12 +102,14 @@ def pdf_of(board: Board, paper: Paper, name: str) -> bytes:
     columns, rows = board.squares
     words = (f"Saccade board: {columns} x {rows} squares of {1e3 * board.square_m:g} mm, markers of "
              f"{1e3 * board.marker_m:g} mm, dictionary {board.dictionary}, described by {name}",
-             f"Print at 100 % (\"actual size\", not \"fit to page\"). The line above must be {1e3 * paper.ruler_m:.0f} mm "
-             "long: measure it. If it is not,",
+             "Print at 100 % (\"actual size\", not \"fit to page\"). The line above must be "
+             f"{1e3 * paper.ruler_m:.0f} mm long: measure it. If it is not,",
              "print again, or write the description again with --measured-mm and the length that you measure. Glue the "
-             "sheet onto something flat.")
+             "sheet onto something flat.",
+             "The origin of the world is the middle of the squares: x points to the right of this sheet, y to its top, "
+             "z up.")
     for k, text in enumerate(words):
-        axes.text(paper.width_m / 2, MARGIN_M + 0.0105 - 0.0038 * k, text.replace("$", r"\$"), ha="center", va="center",
+        axes.text(paper.width_m / 2, MARGIN_M + 0.0108 - 0.0034 * k, text.replace("$", r"\$"), ha="center", va="center",
                   fontsize=FONT_PT)
     drawn = io.BytesIO()
     with rc_context({"pdf.fonttype": 42}):

@@ -29,8 +29,8 @@ def board(*, out: Annotated[Path, typer.Option(help="The sheet; its description 
     printed = as_printed(made, paper, measured_m)
     told = write_sheet(out, made, paper, measured_m)
     columns, rows = made.squares
-    print(f"{out}: {columns}x{rows} squares of {1e3 * made.square_m:g} mm on {size.upper()}; print it at 100% and measure "
-          f"the ruler: {1e3 * paper.ruler_m:.0f} mm")
+    print(f"{out}: {columns}x{rows} squares of {1e3 * made.square_m:g} mm on {size}; print it at 100% and measure the "
+          f"ruler: {1e3 * paper.ruler_m:.0f} mm")
     print(f"{told}: its description, with squares of {1e3 * printed.square_m:.4g} mm")
 
 
@@ -45,7 +45,7 @@ def calibrate(source: Annotated[str, typer.Argument(
                   help="File for the calibration. The picture of its residuals is put beside it, as .png.",
                   metavar="CAMERA.toml", show_default="camera.toml")] = None,
               name: Annotated[str | None, typer.Option(
-                  help="Keep it under this name of your camera instead; `--calibration NAME` finds it.")] = None) -> None:
+                  help="Keep it under this name instead; `--calibration NAME` finds it.")] = None) -> None:
     """Find the intrinsics and the distortion of a camera from views of a board."""
     from rich.console import Console
 

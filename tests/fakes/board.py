@@ -1,4 +1,4 @@
-"""Images of a printed board as a lens would show it: every pixel's ray is followed to the sheet. No renderer is used."""
+"""Images of a printed board as a lens would show it: every pixel's ray is followed to the sheet, without a renderer."""
 
 from __future__ import annotations
 
