@@ -22,7 +22,7 @@ LEAST_CORNERS, LEAST_SHARE = 8, 0.25  # of the corners, for a view to be of use
 APART = 0.04  # of the image's width: views whose boards are nearer to each other are one view
 LARGEST_SIGMA = 0.01  # of the focal length, as a share; views that are too alike leave it open
 LARGEST_RMS = 0.003  # of the image's width
-BAD_VIEW = 2.5  # times the median of the views' errors
+BAD_VIEW, BAD_CORNER = 2.5, 5.0  # times the median error of views, and of corners
 HOW = "film the board from many sides, tilted by up to 45 degrees, in every part of the image"
 
 
@@ -79,7 +79,8 @@ def spread(board: Board, views: Sequence[View], size_px: Size, most: int = MOST_
 
 
 def solve(board: Board, views: Sequence[View], size_px: Size, model: Model) -> Solved:
-    """Finds intrinsics and distortion from views of use. Views with much larger errors than the others are left out.
+    """Finds intrinsics and distortion from views of use. Corners and views with much larger errors than the others
+    are left out.
 
     Raises SaccadeError if there are too few views, if they are too alike, or if no lens explains them.
     """
@@ -88,9 +89,8 @@ def solve(board: Board, views: Sequence[View], size_px: Size, model: Model) -> S
         raise SaccadeError(f"{len(views)} images show the board, of which {len(chosen)} differ enough, and "
                            f"{LEAST_VIEWS} are needed: {HOW}")
     solved = _solved(board, chosen, size_px, model)
-    errors = np.array([np.sqrt((rest ** 2).sum(1).mean()) for rest in solved.residuals])
-    good = [view for view, error in zip(chosen, errors, strict=True) if error <= BAD_VIEW * np.median(errors)]
-    if LEAST_VIEWS <= len(good) < len(chosen):
+    good = _good(board, solved)
+    if len(good) >= LEAST_VIEWS:
         solved = _solved(board, good, size_px, model)
     if not solved.focal_sigma <= LARGEST_SIGMA:  # also if it is NaN
         raise SaccadeError(f"the {len(solved.views)} views are too alike: they leave the focal length open by "
@@ -99,6 +99,17 @@ def solve(board: Board, views: Sequence[View], size_px: Size, model: Model) -> S
         raise SaccadeError(f"no {model} lens explains the views: {solved.calibration.rms_px:.1f} pixels are left; is "
                            "it the printed board that the file describes, and is it flat? Try the other --model")
     return solved
+
+
+def _good(board: Board, solved: Solved) -> list[View]:
+    """The views without the corners that were not found right, and without those whose errors are much larger."""
+    distances = [np.linalg.norm(rest, axis=1) for rest in solved.residuals]
+    usual = BAD_CORNER * float(np.median(np.concatenate(distances)))
+    kept = [View(view.name, view.corners.of(distance <= usual))
+            for view, distance in zip(solved.views, distances, strict=True)]
+    errors = np.array([np.median(distance) for distance in distances])
+    return [view for view, error in zip(kept, errors, strict=True)
+            if error <= BAD_VIEW * np.median(errors) and is_of_use(board, view.corners)]
 
 
 def _solved(board: Board, views: Sequence[View], size_px: Size, model: Model) -> Solved:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from saccade.services.camera.board_pose import Doubtful, measure
-from saccade.services.camera.charuco import Board, Finder
+from saccade.services.camera.charuco import Board, Corners, Finder
 from saccade.services.camera.pose_filter import PoseFilter
 from saccade.services.camera.sources import SourceImage
 from saccade.services.camera.trajectories.lens import Lens
@@ -32,13 +32,17 @@ class BoardPoses:
 
     def of(self, image: SourceImage) -> Array | None:
         """The camera's pose [4, 4] at an image. None if the board does not show it beyond doubt."""
-        measured = measure(self.board, self._finder.find(image.rgb), self.lens)
+        return self.from_corners(self._finder.find(image.rgb), image.time_s)
+
+    def from_corners(self, corners: Corners, time_s: float) -> Array | None:
+        """The camera's pose [4, 4] from the corners that an image of this time shows, or None."""
+        measured = measure(self.board, corners, self.lens)
         if isinstance(measured, Doubtful):
             self.why_not[measured.reason] += 1
             return None
         if self._filter is None:
             return measured.world_from_camera
-        smoothed = self._filter.take(image.time_s, measured)
+        smoothed = self._filter.take(time_s, measured)
         if smoothed is None:
             self.why_not[REFUSED] += 1
         return smoothed

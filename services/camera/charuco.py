@@ -24,6 +24,7 @@ MAX_FILE_BYTES = 1 * MIB
 MOST_SQUARES, LEAST_SQUARES = 60, 4
 RING = 2  # squares between the edge and a free middle: the corners between two squares are found
 ENOUGH, LARGE_PX = 0.75, 1300  # share of the corners; width of an image that is not enlarged
+SHARPENED_PX, SHARPENED = 3.0, 2.0  # radius and strength
 _NEED = "give the .json that `saccade board` wrote beside the PDF"
 
 Squares = Annotated[int, Field(ge=LEAST_SQUARES, le=MOST_SQUARES)]
@@ -129,12 +130,15 @@ class Finder:
 
     def find(self, rgb: NDArray[np.uint8]) -> Corners:
         """The corners in an image [H, W, 3]; there may be none. If many are missing in a small image, they are looked
-        for once more in one of twice the size: there the cells of small markers can be told apart."""
+        for once more in a sharpened one of twice the size: there the cells of small or blurred markers can be told
+        apart."""
         grey = self._cv2.cvtColor(rgb, self._cv2.COLOR_RGB2GRAY)
         found = self._corners(grey)
         if len(found.ids) >= ENOUGH * self._usable.sum() or grey.shape[1] > LARGE_PX:
             return found
-        twice = self._corners(self._cv2.resize(grey, None, fx=2, fy=2, interpolation=self._cv2.INTER_CUBIC))
+        large = self._cv2.resize(grey, None, fx=2, fy=2, interpolation=self._cv2.INTER_CUBIC)
+        smooth = self._cv2.GaussianBlur(large, (0, 0), SHARPENED_PX)
+        twice = self._corners(self._cv2.addWeighted(large, 1 + SHARPENED, smooth, -SHARPENED, 0))
         return Corners(twice.ids, twice.pixels / 2) if len(twice.ids) > len(found.ids) else found
 
     def _corners(self, grey: NDArray[np.uint8]) -> Corners:
@@ -148,6 +152,15 @@ class Finder:
 
 def _dictionary(aruco: Any, board: Board) -> Any:
     return aruco.getPredefinedDictionary(getattr(aruco, f"DICT_{board.dictionary}"))
+
+
+def grey_of(board: Board, *, texels_per_m: float, margin_m: float) -> NDArray[np.uint8]:
+    """The sheet as grey values [H, W], with a white margin. Raises SaccadeError if OpenCV is missing."""
+    half = board.size_m / 2 + margin_m
+    sheet = np.full(np.round(2 * half[::-1] * texels_per_m).astype(int), 255, dtype=np.uint8)
+    for left, bottom, right, top in np.round((black_boxes_m(board) + np.tile(half, 2)) * texels_per_m).astype(int):
+        sheet[len(sheet) - top:len(sheet) - bottom, left:right] = 0
+    return sheet
 
 
 def black_boxes_m(board: Board) -> Array:

@@ -15,7 +15,7 @@ from saccade.services.camera.board_pose import Measured
 from saccade.shared.world.geometry import Array, pose, rotation_angle
 
 MAX_GAP_S = 1.0  # after a longer time without a pose, the next begins a new track
-ACCELERATION_M, ACCELERATION_RAD = 3.0, 12.0  # standard deviations, per second squared, of a camera held in a hand
+ACCELERATION_M, ACCELERATION_RAD = 1.5, 6.0  # standard deviations, per second squared, of a camera held in a hand
 VELOCITY_M, VELOCITY_RAD = 0.6, 1.5  # standard deviations of the first velocity, per second
 FLOOR_M, FLOOR_RAD = 0.0007, 0.0015  # of a measured pose: what the lens and the print are wrong by
 GATE = 33.1  # chi squared of six numbers that one measurement in 100,000 exceeds

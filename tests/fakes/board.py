@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 
-from saccade.services.camera.charuco import Board, black_boxes_m
+from saccade.services.camera.charuco import Board, grey_of
 from saccade.services.camera.trajectories.lens import lens
 from saccade.shared.world.geometry import direction, look_at, pose
 
@@ -23,13 +23,7 @@ MARGIN_M = 0.01
 
 def printed(board: Board = SHEET) -> np.ndarray:
     """The sheet as grey values [H, W] from 0 to 1, with a white margin."""
-    half = board.size_m / 2 + MARGIN_M
-    sheet = np.ones(np.round(2 * half[::-1] * TEXELS_PER_M).astype(int))
-    for left, bottom, right, top in black_boxes_m(board):
-        rows = np.round(np.array([half[1] - top, half[1] - bottom]) * TEXELS_PER_M).astype(int)
-        columns = np.round(np.array([left + half[0], right + half[0]]) * TEXELS_PER_M).astype(int)
-        sheet[slice(*rows), slice(*columns)] = 0.0
-    return sheet
+    return grey_of(board, texels_per_m=TEXELS_PER_M, margin_m=MARGIN_M) / 255
 
 
 def seen(world_from_camera, camera=PINHOLE, board: Board = SHEET, sheet: np.ndarray | None = None) -> np.ndarray:
