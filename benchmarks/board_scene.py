@@ -45,13 +45,14 @@ class Scene:
             mesh.name: ((*BESIDE[mesh.name], mesh.size_m[2] / 2), 0.6) for mesh in meshes[1:]})
         u, v = np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5)
         rays = LENS.rays(np.stack([u, v], axis=-1).reshape(-1, 2)).reshape(*SIZE[::-1], 2)
-        self._places = (focal * rays + RENDER_PX / 2 - 0.5).astype(np.float32)
+        places = (focal * rays + RENDER_PX / 2 - 0.5).astype(np.float32)
+        self._u, self._v = places[..., 0].copy(), places[..., 1].copy()
         away = (u / SIZE[0] - 0.3) ** 2 + (v / SIZE[1] - 0.3) ** 2
         self._light = (1.0 - 0.35 * away)[..., None]  # it falls towards a corner
 
     def seen(self, poses: Iterable[Array], rng: np.random.Generator) -> NDArray[np.uint8]:
         """The image [480, 640, 3] of an exposure during which the camera has these poses [4, 4]."""
-        light = np.mean([cv2.remap(self._world.render(one), self._places, None, cv2.INTER_LINEAR).astype(np.float64)
+        light = np.mean([cv2.remap(self._world.render(one), self._u, self._v, cv2.INTER_LINEAR).astype(np.float64)
                          for one in poses], axis=0)
         return np.clip(light * self._light + rng.normal(0, NOISE, light.shape), 0, 255).round().astype(np.uint8)
 
