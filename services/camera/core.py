@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from saccade.services.camera.board_poses import BoardPoses
 from saccade.services.camera.calibration import read_calibration
 from saccade.services.camera.charuco import read_board
 from saccade.services.camera.poses import Poses, asked_of, read_poses
 from saccade.services.camera.sources import Folder, Source, SourceImage, open_source
-from saccade.services.camera.trajectories.lens import Lens, one_lens
+from saccade.services.camera.trajectories.lens import Lens
 from saccade.services.camera.virtual_camera import VirtualCamera
 from saccade.shared.bus.messages import Frame, Goal
 from saccade.shared.bus.topics import ACTION, FRAME, GOAL, Output
@@ -24,6 +24,9 @@ from saccade.shared.world.goal_image import LONGEST_PX, GoalImage, read_goal_ima
 from saccade.shared.world.images import Size
 from saccade.shared.world.photographs import read_photograph
 from saccade.shared.world.task import start_pose
+
+if TYPE_CHECKING:
+    from saccade.services.camera.board_poses import BoardPoses
 
 SERVICE = Service("camera", inputs=(ACTION,), trigger=ACTION, outputs=(FRAME, GOAL))
 WHOLE = 0.995  # share of the networks' field of view; if the camera covers less, the user is told
@@ -129,11 +132,9 @@ def _lens(camera: CameraConfig, poses: Poses, size_px: Size) -> tuple[Lens | Non
         told = f"intrinsics ({', '.join(f'{x:.2f}' for x in lens.of(size_px))}) px are those of the calibration"
         return lens, (f"{told} {camera.calibration}", *_removed(lens))
     if camera.intrinsics_px is not None:
-        of_file, _ = one_lens(poses.lenses)
-        kept = of_file is not None and of_file.distorts
-        return Lens(camera.intrinsics_px, size_px), (
-            ("the distortion that the poses' file tells of is not removed, because camera.intrinsics_px is given",)
-            if kept else ())
+        kept = any(lens.distorts for lens in poses.lenses)
+        note = "the distortion that the poses' file tells of is not removed, because camera.intrinsics_px is given"
+        return Lens(camera.intrinsics_px, size_px), (note,) if kept else ()
     found, notes = poses.lens(size_px)
     return found, (*notes, *_removed(found))
 
@@ -146,6 +147,8 @@ def _by_board(camera: CameraConfig, source: Source, lens: Lens | None) -> BoardP
     """The poses from a board, None if there is none. Images of a folder may be taken far from one another."""
     if camera.board is None or lens is None:
         return None
+    from saccade.services.camera.board_poses import BoardPoses  # loads a filter that nothing else here needs
+
     return BoardPoses(read_board(camera.board), lens, camera.board, smooth=not isinstance(source, Folder))
 
 
