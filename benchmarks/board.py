@@ -27,7 +27,7 @@ from saccade.services.camera.trajectories.lens import Lens
 from saccade.shared.log.provenance import commit
 from saccade.shared.world.geometry import rotation_angle
 
-CLIPS, FRAMES, SEED = 16, 24, 7
+CLIPS, FRAMES, SEED = 10, 24, 7
 CALIBRATION_CLIPS, CALIBRATION_FRAMES = 30, 1  # many short looks, as somebody who holds the camera still now and then
 
 

@@ -21,9 +21,9 @@ OUTLIER_SHARE = 0.004  # of the image's width: a corner further from where the b
 KEPT_SHARE = 0.7  # of the corners; if more of them are outliers, nothing is believed
 LARGEST_RMS_SHARE = 0.0025  # of the image's width: 1.6 of 640 pixels
 LEAST_SIGMA_PX = 0.3  # of a corner; fewer pixels than found right by chance
-TWICE_AS_GOOD = 30.0  # difference of chi squared between the two ways that a board may be tilted
+CLEARLY_BETTER = 30.0  # difference of chi squared between the two ways that a board may be tilted
 SAME_RAD = np.radians(3.0)  # two solutions that are nearer to each other are one
-MAX_SIGMA_M, MAX_SIGMA_RAD = 0.01, np.radians(1.0)
+MAX_SIGMA_M, MAX_SIGMA_RAD = 0.006, np.radians(0.7)  # three of them are less than two centimetres
 ROUNDS, STEP = 10, 1e-6  # of Gauss and Newton; of a numerical derivative (metres, radians)
 
 
@@ -140,7 +140,7 @@ def _judged(found: list[Measured], largest_rms_px: float, count: int) -> Measure
         return Doubtful("the camera would be below the board")
     if other and rotation_angle(best.world_from_camera[:3, :3], other[0].world_from_camera[:3, :3]) > SAME_RAD:
         variance = max(LEAST_SIGMA_PX, best.rms_px / np.sqrt(2)) ** 2
-        if count * (other[0].rms_px ** 2 - best.rms_px ** 2) / variance < TWICE_AS_GOOD:
+        if count * (other[0].rms_px ** 2 - best.rms_px ** 2) / variance < CLEARLY_BETTER:
             return Doubtful("the board may be tilted either way: go nearer, or look at it from the side")
     sigma_m, sigma_rad = (float(np.sqrt(np.linalg.eigvalsh(best.covariance[k:k + 3, k:k + 3]).max())) for k in (0, 3))
     if sigma_m > MAX_SIGMA_M or sigma_rad > MAX_SIGMA_RAD:
