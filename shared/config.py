@@ -162,6 +162,11 @@ class CameraConfig(Section):
     """Undo the `applied_transform` of a transforms.json."""
     intrinsics_px: tuple[Focal, Focal, FiniteFloat, FiniteFloat] | None = None
     """fx, fy, cx, cy of the source's images, in pixels."""
+    board: Path | None = None
+    """Description of a printed board on the table, which tells the camera's poses. `saccade board` writes it."""
+    calibration: str | None = None
+    """File that `saccade calibrate` wrote, or the name of a camera under which it is kept. It tells the intrinsics and
+    the distortion of the lens, which is removed."""
     rate_hz: float = Field(10.0, gt=0, le=1000)
     """Images per second from a folder or a webcam. A video has its own rate."""
     loop: bool = False

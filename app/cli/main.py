@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from saccade.app.cli import bench, log, look, objects, poses, replay, run, train
+from saccade.app.cli import bench, camera, log, look, objects, poses, replay, run, train
 from saccade.app.cli.front import FrontDoor, command_of
 from saccade.app.run.threads import prefer_one_thread
 from saccade.shared.errors import LINE_LIMIT, SaccadeError, printable
@@ -40,7 +40,7 @@ def front_door(version: Annotated[bool, typer.Option(
     """An active-vision agent: it looks, believes and moves until it sees the goal image."""
 
 
-for commands in (run, replay, bench, train, look):
+for commands in (run, replay, bench, train, look, camera):
     app.add_typer(commands.app)
 app.add_typer(log.app, name="log")
 app.add_typer(poses.app, name="poses")

@@ -56,6 +56,12 @@ def run(*, objects: Objects = None, names: Names = None, scenes: ScenesFile = No
             help="File or folder with the camera's poses, such as TUM, transforms.json or COLMAP.")] = None,
         intrinsics: Annotated[str | None, typer.Option(
             help="Intrinsics of the camera's images, in pixels.", metavar="fx,fy,cx,cy")] = None,
+        board: Annotated[Path | None, typer.Option(
+            help="Description of a printed board on the table, which tells the camera's poses (`saccade board`).",
+            metavar="BOARD.json")] = None,
+        calibration: Annotated[str | None, typer.Option(
+            help="Calibration of the camera (`saccade calibrate`): a file, or the name of a camera.",
+            metavar="FILE|NAME")] = None,
         rate: Annotated[float | None, typer.Option(
             help="Images per second, of a folder or a webcam.", show_default="10")] = None,
         loop: Annotated[bool, typer.Option("--loop", help="Begin again with the first image after the last.")] = False,
@@ -77,7 +83,8 @@ def run(*, objects: Objects = None, names: Names = None, scenes: ScenesFile = No
              "scene.goal_image": goal,
              "scene.goal_intrinsics_px": numbers(goal_intrinsics, "--goal-intrinsics"),
              "scene.explore": explore or None, "bus.kind": bus,
-             "perception.weights": weights, "camera.source": source, "camera.poses": poses,
+             "perception.weights": weights, "camera.source": source, "camera.poses": poses, "camera.board": board,
+             "camera.calibration": calibration,
              "camera.intrinsics_px": numbers(intrinsics), "camera.rate_hz": rate, "camera.loop": loop or None}
     console = Console()
 

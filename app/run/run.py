@@ -19,7 +19,9 @@ from saccade.app.run.launch import launched
 from saccade.app.run.registry import DEFAULT_WORLD, agent_of, agent_processes, local_pairs, require_services, world_of
 from saccade.app.run.summary import summary
 from saccade.app.run.supervisor import VIEWER
+from saccade.services.camera.calibration import calibration_path
 from saccade.services.camera.core import build as build_camera
+from saccade.services.camera.core import require_one_of_each
 from saccade.services.camera.sources import absolute, webcam_number
 from saccade.services.recorder.core import describe, to_be_finished
 from saccade.services.viewer.server import binary, url_of, with_free_ports
@@ -116,6 +118,8 @@ def in_world(config: Config, world: str) -> Config:
     config = config.with_values({"scene.explore": scene.explore or scene.goal_image is None,
                                  "bus.live": config.bus.kind == "zenoh"})
     from_outside = config.services.source is not None
+    if not from_outside:
+        require_one_of_each(camera)
     if not from_outside and (camera.source is None or webcam_number(camera.source) is None):
         build_camera(config)  # not for a webcam, because this would switch it on and off
     return config
@@ -125,8 +129,11 @@ def resolve(config: Config) -> Config:
     """Returns the configuration with the names of its objects and with absolute paths."""
     scene = config.scene
     paths = {"scene.file": scene.file, "scene.goal_image": scene.goal_image,
-             "camera.poses": config.camera.poses, "perception.weights": config.perception.weights}
+             "camera.poses": config.camera.poses, "camera.board": config.camera.board,
+             "perception.weights": config.perception.weights}
     source = {} if config.camera.source is None else {"camera.source": absolute(config.camera.source)}
+    if config.camera.calibration is not None:
+        paths["camera.calibration"] = calibration_path(config.camera.calibration)
     return config.with_values({"scene.names": list(names_in_use(scene))} | source |
                               {key: path.resolve() for key, path in paths.items() if path is not None})
 

@@ -3,22 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from saccade.services.camera.calibration import read_calibration
+from saccade.services.camera.charuco import read_board
 from saccade.services.camera.poses import Poses, asked_of, read_poses
-from saccade.services.camera.sources import Source, SourceImage, open_source
+from saccade.services.camera.sources import Folder, Source, SourceImage, open_source
+from saccade.services.camera.trajectories.lens import Lens
 from saccade.services.camera.virtual_camera import VirtualCamera
 from saccade.shared.bus.messages import Frame, Goal
 from saccade.shared.bus.topics import ACTION, FRAME, GOAL, Output
-from saccade.shared.config import Config
+from saccade.shared.config import CameraConfig, Config
 from saccade.shared.errors import SaccadeError
 from saccade.shared.loop.service import Inputs, Service
 from saccade.shared.world.geometry import IMAGE_SIZE_PX, INTRINSICS_PX
 from saccade.shared.world.goal_image import LONGEST_PX, GoalImage, read_goal_image
-from saccade.shared.world.photographs import Intrinsics, read_photograph
+from saccade.shared.world.images import Size
+from saccade.shared.world.photographs import read_photograph
 from saccade.shared.world.task import start_pose
+
+if TYPE_CHECKING:
+    from saccade.services.camera.board_poses import BoardPoses
 
 SERVICE = Service("camera", inputs=(ACTION,), trigger=ACTION, outputs=(FRAME, GOAL))
 WHOLE = 0.995  # share of the networks' field of view; if the camera covers less, the user is told
@@ -35,7 +43,7 @@ class Camera:
 
     episodes = 1
 
-    def __init__(self, source: Source, poses: Poses, virtual_camera: VirtualCamera, *,
+    def __init__(self, source: Source, poses: Poses | BoardPoses, virtual_camera: VirtualCamera, *,
                  goal_rgb: NDArray[np.uint8] | None = None, loop: bool = False, notes: tuple[str, ...] = ()):
         self.source, self.poses, self.virtual_camera = source, poses, virtual_camera
         self.goal_rgb, self.loop, self.notes = goal_rgb, loop, notes
@@ -49,8 +57,7 @@ class Camera:
         frame = self.next_frame()
         if not frame:
             seen = f"{self.skipped} images of {self.source.name} ({self._first} to {self._last})"
-            raise SaccadeError(f"none of the {seen} has a pose in {self.poses}: give poses by the images' names, "
-                               "indices or times")
+            raise SaccadeError(f"none of the {seen} has a pose in {self.poses}: {self.poses.advice}")
         goal = Goal(run=run, episode=episode, step=0, rgb=self.goal_rgb, intrinsics_px=np.array(INTRINSICS_PX))
         return [Output(GOAL, goal), *frame]
 
@@ -86,20 +93,63 @@ class Camera:
 def build(config: Config) -> Camera:
     """Creates the camera from a configuration.
 
-    Raises SaccadeError if the source, the poses, the intrinsics or the goal image are missing, damaged or do not fit.
+    Raises SaccadeError if the source, the poses, the board, the calibration, the intrinsics or the goal image are
+    missing, damaged or do not fit.
     """
     camera = config.camera
+    require_one_of_each(camera)
     if camera.source is None:
         raise SaccadeError("camera.source is not given: give a folder of images, a video file, or a webcam (webcam:0)")
     source = open_source(camera.source, rate_hz=camera.rate_hz)
     poses = Poses.still(start_pose()) if camera.poses is None else read_poses(camera.poses, asked=asked_of(camera))
     poses = poses.matched([path.name for path in getattr(source, "paths", ())])
-    intrinsics_px, told = (camera.intrinsics_px, ()) if camera.intrinsics_px else poses.intrinsics_px(source.size_px)
-    virtual_camera = VirtualCamera(source.size_px, intrinsics_px)
+    lens, told = _lens(camera, poses, source.size_px)
+    virtual_camera = VirtualCamera(source.size_px, lens=lens)
     goal = _goal_of(config, virtual_camera)
-    assumed = _notes(config, virtual_camera, intrinsics_px)
+    assumed = _notes(config, virtual_camera, lens)
     notes = (*poses.notes, *told, *assumed, *((goal.note,) if goal else ()))
-    return Camera(source, poses, virtual_camera, goal_rgb=goal.rgb if goal else None, loop=camera.loop, notes=notes)
+    return Camera(source, _by_board(camera, source, lens) or poses, virtual_camera,
+                  goal_rgb=goal.rgb if goal else None, loop=camera.loop, notes=notes)
+
+
+def require_one_of_each(camera: CameraConfig) -> None:
+    """Raises SaccadeError if two keys tell the same, or if the board's poses need what is not given."""
+    if camera.board is not None and camera.poses is not None:
+        raise SaccadeError("camera.board and camera.poses both tell the camera's poses: give one of them")
+    if camera.calibration is not None and camera.intrinsics_px is not None:
+        raise SaccadeError("camera.calibration and camera.intrinsics_px both tell the intrinsics: give one of them")
+    if camera.board is not None and camera.calibration is None and camera.intrinsics_px is None:
+        raise SaccadeError("camera.board needs the camera's intrinsics: calibrate it with `saccade calibrate` and give "
+                           "camera.calibration, or give camera.intrinsics_px")
+
+
+def _lens(camera: CameraConfig, poses: Poses, size_px: Size) -> tuple[Lens | None, tuple[str, ...]]:
+    """The lens of the images, and notes about it: what the user gives, else what the file of the poses tells. None if
+    nothing is known."""
+    if camera.calibration is not None:
+        read = read_calibration(camera.calibration)
+        lens = read.lens.at(size_px, "the calibration's")
+        told = f"intrinsics ({', '.join(f'{x:.2f}' for x in lens.of(size_px))}) px are those of the calibration"
+        return lens, (f"{told} {camera.calibration}", *_removed(lens))
+    if camera.intrinsics_px is not None:
+        kept = any(lens.distorts for lens in poses.lenses)
+        note = "the distortion that the poses' file tells of is not removed, because camera.intrinsics_px is given"
+        return Lens(camera.intrinsics_px, size_px), (note,) if kept else ()
+    found, notes = poses.lens(size_px)
+    return found, (*notes, *_removed(found))
+
+
+def _removed(lens: Lens | None) -> tuple[str, ...]:
+    return (f"{lens.note()}, is removed",) if lens is not None and lens.distorts else ()
+
+
+def _by_board(camera: CameraConfig, source: Source, lens: Lens | None) -> BoardPoses | None:
+    """The poses from a board, None if there is none. Images of a folder may be taken far from one another."""
+    if camera.board is None or lens is None:
+        return None
+    from saccade.services.camera.board_poses import BoardPoses  # loads a filter that nothing else here needs
+
+    return BoardPoses(read_board(camera.board), lens, camera.board, smooth=not isinstance(source, Folder))
 
 
 def _goal_of(config: Config, virtual_camera: VirtualCamera) -> GoalImage | None:
@@ -120,10 +170,10 @@ def _goal_of(config: Config, virtual_camera: VirtualCamera) -> GoalImage | None:
     return read_goal_image(scene.goal_image, scene.goal_intrinsics_px)
 
 
-def _notes(config: Config, virtual_camera: VirtualCamera, intrinsics_px: Intrinsics | None) -> tuple[str, ...]:
+def _notes(config: Config, virtual_camera: VirtualCamera, lens: Lens | None) -> tuple[str, ...]:
     """Texts for the user, one line each: what is assumed because it is not given, and whether grey is filled in."""
     notes = []
-    if intrinsics_px is None:
+    if lens is None:
         notes.append("camera.intrinsics_px is not given: the central square of each image, resized to "
                      f"{IMAGE_SIZE_PX}x{IMAGE_SIZE_PX} pixels, is assumed to have the simulator's intrinsics (focal "
                      f"length {INTRINSICS_PX[0]:.0f} px); if the true focal length differs, ranges are wrong by the "
@@ -131,7 +181,7 @@ def _notes(config: Config, virtual_camera: VirtualCamera, intrinsics_px: Intrins
     if virtual_camera.coverage < WHOLE:
         notes.append(f"the camera covers {virtual_camera.coverage:.0%} of the networks' field of view: the rest is "
                      "grey, and objects there count as not seen")
-    if config.camera.poses is None:
+    if config.camera.poses is None and config.camera.board is None:
         x, y, z = start_pose()[:3, 3]
         notes.append(f"camera.poses is not given: the camera is assumed to stand still at ({x:.2f}, {y:.2f}, {z:.2f}) "
                      "m and to look at the table's centre; if it moves or stands elsewhere, the positions of objects "

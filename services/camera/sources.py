@@ -17,6 +17,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from saccade.services.camera.opencv import opencv
 from saccade.shared.errors import NAME_LIMIT, SaccadeError, printable
 from saccade.shared.world.images import MAX_PIXELS, Size, image_size, read_image
 
@@ -266,15 +267,7 @@ def _keep_newest(capture: Any, clock: Callable[[], float], newest: queue.Queue, 
 
 def _cv2() -> Any:
     """OpenCV, imported when the first video or webcam is opened. Raises SaccadeError if it is not installed."""
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # quiet, because our own errors say what fails in one line
-    try:
-        import cv2
-    except ImportError as error:
-        raise SaccadeError(f"videos and webcams need OpenCV ({error}): pip install opencv-python-headless, or give a "
-                           "folder of images") from error
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    cv2.setNumThreads(1)  # every service uses one thread
-    return cv2
+    return opencv("videos and webcams need", ", or give a folder of images")
 
 
 def _capture(what: str | int) -> Any:
