@@ -20,7 +20,7 @@ from saccade.app.run.registry import DEFAULT_WORLD, agent_of, agent_processes, l
 from saccade.app.run.summary import summary
 from saccade.app.run.supervisor import VIEWER
 from saccade.services.camera.core import build as build_camera
-from saccade.services.camera.sources import absolute, webcam_number
+from saccade.services.camera.sources import absolute, is_live
 from saccade.services.recorder.core import describe, to_be_finished
 from saccade.services.viewer.server import binary, url_of, with_free_ports
 from saccade.shared.bus.messages import Message, Result
@@ -63,7 +63,9 @@ def run(config: Config, *, agent: str, out: Path | None, plain: bool, console: C
     require_weights(agent, config)
     if view:
         config = to_be_viewed(config)
-    processes = agent_processes(agent, world, view=view) if config.bus.kind == "zenoh" else ()
+    if config.ros.publish and config.bus.kind != "zenoh":
+        raise SaccadeError("ros.publish is for services on the bus: leave `--bus local` out")
+    processes = agent_processes(agent, world, view=view, ros=config.ros.publish) if config.bus.kind == "zenoh" else ()
     folder = _new_folder(out or Path("runs") / f"{time.strftime('%Y%m%d-%H%M%S')}-{config.seed}")
     lacks: list[str] = []
     ended = None  # stays None if the run is interrupted: then no viewer stays
@@ -116,7 +118,7 @@ def in_world(config: Config, world: str) -> Config:
     config = config.with_values({"scene.explore": scene.explore or scene.goal_image is None,
                                  "bus.live": config.bus.kind == "zenoh"})
     from_outside = config.services.source is not None
-    if not from_outside and (camera.source is None or webcam_number(camera.source) is None):
+    if not from_outside and (camera.source is None or not is_live(camera.source)):
         build_camera(config)  # not for a webcam, because this would switch it on and off
     return config
 

@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from saccade.services.camera.poses import Poses, asked_of, read_poses
+from saccade.services.camera.ros.source import RosSource, open_ros_source
+from saccade.services.camera.ros.stream import with_lens
 from saccade.services.camera.sources import Source, SourceImage, open_source
 from saccade.services.camera.virtual_camera import VirtualCamera
 from saccade.shared.bus.messages import Frame, Goal
@@ -28,9 +30,10 @@ class Camera:
     """Turns the images of a source into frames like those of the training, with INTRINSICS_PX and their poses.
 
     All images belong to one episode. A camera that is started again within a run begins another episode. The caller
-    asks for the next frame every `period_s` seconds. Images without a pose are left out and counted in `skipped`. With
-    `loop` the source begins anew when it has ended. `goal_rgb` is the goal image [480, 480, 3]; without it the agent
-    explores. `notes` tells the user what is assumed, one line for each assumption.
+    asks for the next frame every `period_s` seconds. Images without a pose are left out and counted in `skipped`, and
+    so are messages of a ROS source that cannot be decoded. With `loop` the source begins anew when it has ended.
+    `goal_rgb` is the goal image [480, 480, 3]; without it the agent explores. `notes` tells the user what is assumed,
+    one line for each assumption.
     """
 
     episodes = 1
@@ -39,11 +42,16 @@ class Camera:
                  goal_rgb: NDArray[np.uint8] | None = None, loop: bool = False, notes: tuple[str, ...] = ()):
         self.source, self.poses, self.virtual_camera = source, poses, virtual_camera
         self.goal_rgb, self.loop, self.notes = goal_rgb, loop, notes
-        self.period_s, self.skipped = source.period_s, 0
+        self.period_s, self._without_pose = source.period_s, 0
+
+    @property
+    def skipped(self) -> int:
+        """How many images or messages were left out in this episode."""
+        return self._without_pose + getattr(self.source, "left_out", 0)
 
     def begin(self, run: str, episode: int) -> list[Output]:
         """Returns the goal and the first frame. Raises SaccadeError if no image has a pose."""
-        self._run, self._episode, self._published, self.skipped = run, episode, 0, 0
+        self._run, self._episode, self._published, self._without_pose = run, episode, 0, 0
         self._first: SourceImage | None = None
         self._images = self._all_images()
         frame = self.next_frame()
@@ -68,7 +76,7 @@ class Camera:
                               world_from_camera=world_from_camera)
                 self._published += 1
                 return [Output(FRAME, frame)]
-            self.skipped += 1
+            self._without_pose += 1
             if self.source.endless and self.poses.end_before(image):
                 break
         return []
@@ -90,15 +98,17 @@ def build(config: Config) -> Camera:
     """
     camera = config.camera
     if camera.source is None:
-        raise SaccadeError("camera.source is not given: give a folder of images, a video file, or a webcam (webcam:0)")
-    source = open_source(camera.source, rate_hz=camera.rate_hz)
-    poses = Poses.still(start_pose()) if camera.poses is None else read_poses(camera.poses, asked=asked_of(camera))
+        raise SaccadeError("camera.source is not given: give a folder of images, a video file, a ROS 2 bag, or "
+                           "a webcam (webcam:0)")
+    ros = open_ros_source(config)
+    source = ros.source if ros else open_source(camera.source, rate_hz=camera.rate_hz)
+    poses = _poses_of(config, ros)
     poses = poses.matched([path.name for path in getattr(source, "paths", ())])
     intrinsics_px, told = (camera.intrinsics_px, ()) if camera.intrinsics_px else poses.intrinsics_px(source.size_px)
     virtual_camera = VirtualCamera(source.size_px, intrinsics_px)
     goal = _goal_of(config, virtual_camera)
-    assumed = _notes(config, virtual_camera, intrinsics_px)
-    notes = (*poses.notes, *told, *assumed, *((goal.note,) if goal else ()))
+    assumed = _notes(config, virtual_camera, intrinsics_px, still=ros is None and camera.poses is None)
+    notes = (*((ros.told,) if ros else ()), *poses.notes, *told, *assumed, *((goal.note,) if goal else ()))
     return Camera(source, poses, virtual_camera, goal_rgb=goal.rgb if goal else None, loop=camera.loop, notes=notes)
 
 
@@ -120,7 +130,17 @@ def _goal_of(config: Config, virtual_camera: VirtualCamera) -> GoalImage | None:
     return read_goal_image(scene.goal_image, scene.goal_intrinsics_px)
 
 
-def _notes(config: Config, virtual_camera: VirtualCamera, intrinsics_px: Intrinsics | None) -> tuple[str, ...]:
+def _poses_of(config: Config, ros: RosSource | None) -> Poses:
+    """The poses of a file, else those of a ROS source, else the one of a camera that stands still."""
+    camera = config.camera
+    if camera.poses is None:
+        return ros.poses if ros else Poses.still(start_pose())
+    poses = read_poses(camera.poses, asked=asked_of(camera))
+    return with_lens(poses, ros.poses) if ros else poses
+
+
+def _notes(config: Config, virtual_camera: VirtualCamera, intrinsics_px: Intrinsics | None, *,
+           still: bool) -> tuple[str, ...]:
     """Texts for the user, one line each: what is assumed because it is not given, and whether grey is filled in."""
     notes = []
     if intrinsics_px is None:
@@ -131,7 +151,7 @@ def _notes(config: Config, virtual_camera: VirtualCamera, intrinsics_px: Intrins
     if virtual_camera.coverage < WHOLE:
         notes.append(f"the camera covers {virtual_camera.coverage:.0%} of the networks' field of view: the rest is "
                      "grey, and objects there count as not seen")
-    if config.camera.poses is None:
+    if still:
         x, y, z = start_pose()[:3, 3]
         notes.append(f"camera.poses is not given: the camera is assumed to stand still at ({x:.2f}, {y:.2f}, {z:.2f}) "
                      "m and to look at the table's centre; if it moves or stands elsewhere, the positions of objects "
