@@ -53,8 +53,9 @@ def test_the_images_of_a_bag_come_with_their_poses(tmp_path, storage):
         np.testing.assert_allclose(frame.world_from_camera, HERE, atol=1e-9)
     assert camera.period_s == pytest.approx(0.1)
     assert camera.skipped == 0
-    assert camera.notes[0] == ("bag b: images /camera/image_raw (sensor_msgs/msg/Image), intrinsics "
-                               "/camera/camera_info, poses of camera_optical in world by world -> base -> camera_optical")
+    assert camera.notes[0] == (
+        "bag b: images /camera/image_raw (sensor_msgs/msg/Image), intrinsics /camera/camera_info, poses of "
+        "camera_optical in world by world -> base -> camera_optical")
     assert camera.notes[1] == "intrinsics (61.00, 62.00, 32.00, 24.00) px are those of /camera/camera_info"
 
 
