@@ -180,7 +180,7 @@ class CameraConfig(Section):
 class RosConfig(Section):
     """ROS 2 nodes whose middleware is `rmw_zenoh`."""
 
-    endpoint: str = "tcp/127.0.0.1:7447"
+    router: str = "tcp/127.0.0.1:7447"
     """Address of the Zenoh router of ROS 2."""
     domain: int = Field(0, ge=0, le=232)
     """Domain of ROS 2 (ROS_DOMAIN_ID)."""

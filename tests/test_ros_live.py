@@ -50,7 +50,7 @@ def endpoint():
 
 
 def config_of(endpoint, source=f"ros:{IMAGE}", **values):
-    return Config().with_values({"ros.endpoint": endpoint, "camera.source": source, "camera.rate_hz": 100, **values})
+    return Config().with_values({"ros.router": endpoint, "camera.source": source, "camera.rate_hz": 100, **values})
 
 
 class CameraNode:
@@ -173,7 +173,7 @@ def test_a_topic_or_tf_that_falls_silent_is_said(silent, words, without_pose):
 def test_a_router_that_is_not_there_is_said(monkeypatch):
     monkeypatch.setattr("saccade.shared.ros.session.ROUTER_S", 0.2)
     said = complaint(build, config_of("tcp/127.0.0.1:9"))
-    assert said.startswith("ros.endpoint: at tcp/127.0.0.1:9 does not answer")
+    assert said.startswith("ros.router: at tcp/127.0.0.1:9 does not answer")
     assert said.endswith("`ros2 run rmw_zenoh_cpp rmw_zenohd` starts the router of ROS 2")
 
 

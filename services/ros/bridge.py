@@ -44,7 +44,7 @@ def _work(config: Config, folder: Path, inbox: Inbox) -> None:
           Heartbeat(bus, health, inbox.stop)):
         teller = Teller(config.scene.names or (), config.camera.world_frame or WORLD)
         bus.subscribe(teller.topics, inbox.put)
-        health.say("ready", f"publishes {' and '.join(node.topics)} at {config.ros.endpoint}")
+        health.say("ready", f"publishes {' and '.join(node.topics)} at {config.ros.router}")
         bridge(teller, node, inbox, health)
 
 

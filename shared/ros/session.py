@@ -18,7 +18,7 @@ def open_ros(ros: RosConfig) -> zenoh.Session:
     from saccade.shared.bus.session import open_session
 
     try:
-        return open_session(ros.endpoint, listen=False, onlooker=False, timeout_s=ROUTER_S)
+        return open_session(ros.router, listen=False, onlooker=False, timeout_s=ROUTER_S)
     except SaccadeError as error:
-        raise SaccadeError(f"ros.endpoint: {str(error).removeprefix('bus ')}; `ros2 run rmw_zenoh_cpp rmw_zenohd` "
+        raise SaccadeError(f"ros.router: {str(error).removeprefix('bus ')}; `ros2 run rmw_zenoh_cpp rmw_zenohd` "
                            "starts the router of ROS 2") from error

@@ -127,7 +127,7 @@ def open_live_source(topic: str, camera: CameraConfig, ros: RosConfig) -> tuple[
         raise
     poses = poses_of(choice, "tf")
     source = LiveSource(session, subscribers, ears, choice, chooser, camera.rate_hz)
-    return source, poses, f"ROS at {ros.endpoint}: {choice.told}"
+    return source, poses, f"ROS at {ros.router}: {choice.told}"
 
 
 def _chosen(chooser: Chooser, ears: Ears, topic: str) -> Choice:
@@ -140,7 +140,7 @@ def _chosen(chooser: Chooser, ears: Ears, topic: str) -> Choice:
             return chooser.choose()
     if not chooser.images and not chooser.undecodable:
         raise SaccadeError(f"{ROS_PREFIX}{topic} gives no image: is its name right, does its node run with rmw_zenoh, "
-                           f"and is this its router and domain (ros.endpoint, ros.domain)? {chooser.seen} other "
+                           f"and is this its router and domain (ros.router, ros.domain)? {chooser.seen} other "
                            "messages were heard")
     return chooser.choose()
 
