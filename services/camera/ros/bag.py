@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -23,7 +24,7 @@ class BagSource:
     """The images of a bag, with their poses. It reads the bag again each time it is iterated, and holds no more of it
     than a chunk and the images that wait for a transform.
 
-    `left_out` counts the messages that could not be decoded since the iteration began.
+    `left_out` counts the messages that could not be decoded.
     """
 
     endless = False
@@ -32,16 +33,16 @@ class BagSource:
         self.name, self.size_px = str(bag.path), choice.size_px
         self.period_s = choice.period_s or 1.0 / rate_hz
         self._bag, self._choice, self._fixed = bag, choice, tree.fixed()
-        self._stream: Stream | None = None
+        self._left_out: Counter[str] = Counter()
 
     @property
     def left_out(self) -> int:
         """How many messages could not be decoded."""
-        return sum(self._stream.left_out.values()) if self._stream else 0
+        return sum(self._left_out.values())
 
     def __iter__(self) -> Iterator[RosImage]:
         choice = self._choice
-        stream = self._stream = Stream(choice, self._fixed.fixed())
+        stream = Stream(choice, self._fixed.fixed(), self._left_out)
         for raw in self._bag.messages(choice.wants):
             stream.take(raw)
             yield from stream.ready()

@@ -57,11 +57,12 @@ def base_of(topic: str) -> str:
     return head if tail in TRANSPORTS else topic
 
 
-def info_topic(image: str, infos: Collection[str] | None = None) -> str | None:
-    """The topic of the CameraInfo that belongs to a topic of images, by its name. With `infos` it must be one of
-    them."""
+def info_topics(image: str) -> tuple[str, str]:
+    """The topics on which the CameraInfo of a topic of images can be, the usual one first."""
     base = base_of(image)
-    named = (f"{base.rpartition('/')[0]}/{INFO}", f"{base}/{INFO}")
-    if infos is None:
-        return named[0]
-    return next((name for name in named if name in infos), None)
+    return f"{base.rpartition('/')[0]}/{INFO}", f"{base}/{INFO}"
+
+
+def info_topic(image: str, infos: Collection[str]) -> str | None:
+    """The topic of the CameraInfo that belongs to a topic of images, among `infos`."""
+    return next((name for name in info_topics(image) if name in infos), None)

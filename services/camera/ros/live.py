@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
-from saccade.services.camera.ros.calibration import INFO, info_topic
+from saccade.services.camera.ros.calibration import info_topics
 from saccade.services.camera.ros.choosing import Choice, Chooser
 from saccade.services.camera.ros.storage import MAX_MESSAGE_BYTES, Raw
 from saccade.services.camera.ros.stream import RosImage, RosPoses, Stream, poses_of
@@ -156,8 +156,7 @@ def _subscribed(session: zenoh.Session, ears: Ears, topic: str, camera: CameraCo
         ears.hear(Raw(heard.topic, heard.kind, sample.payload.to_bytes() if size <= MAX_MESSAGE_BYTES else None,
                       time.time_ns()))
 
-    info = info_topic(topic) or INFO
-    keys = [keys_of(ros.domain, topic), keys_of(ros.domain, info), key_of(ros.domain, "/tf", TF)]
+    keys = [keys_of(ros.domain, name) for name in (topic, *info_topics(topic))] + [key_of(ros.domain, "/tf", TF)]
     if camera.pose_topic is not None:
         keys += [key_of(ros.domain, checked_topic(camera.pose_topic), kind) for kind in (POSE, ODOMETRY)]
     history = zenoh.ext.HistoryConfig(detect_late_publishers=True)  # fixed transforms are published once

@@ -48,16 +48,15 @@ class Stream:
     """Takes messages in about the order of time, and yields images with poses in the order of their messages.
 
     An image waits until every transform is known at its stamp, but not longer than for images that are a second
-    newer. Messages that cannot be decoded are counted in `left_out`, by the reason; each reason is printed once.
+    newer. Messages that cannot be decoded are counted in `left_out`, by topic; the first reason of each is printed.
     """
 
-    def __init__(self, choice: Choice, tree: TransformTree | None = None) -> None:
-        self.choice, self.tree = choice, tree or TransformTree()
-        self.left_out: Counter[str] = Counter()
+    def __init__(self, choice: Choice, tree: TransformTree, left_out: Counter[str] | None = None) -> None:
+        self.choice, self.tree = choice, tree
+        self.left_out = Counter() if left_out is None else left_out
         self._waiting: deque[_Waiting] = deque()
         self._bytes, self._newest_ns, self._index = 0, 0, 0
         self._first_ns: int | None = None
-        self._told: set[str] = set()
 
     def take(self, raw: Raw) -> None:
         """Takes a message of a chosen topic, or of tf."""
@@ -95,12 +94,11 @@ class Stream:
         return None
 
     def leave_out(self, topic: str, reason: object) -> None:
-        """Counts a message that cannot be used, and prints the reason if it is a new one."""
-        text = f"{printable(topic, 100)}: {reason}"
+        """Counts a message that cannot be used, and prints the reason if it is the first of its topic."""
+        if not self.left_out[topic]:
+            print(f"saccade: camera: a message is left out: {printable(topic, 100)}: {reason}", file=sys.stderr,
+                  flush=True)
         self.left_out[topic] += 1
-        if topic not in self._told:
-            self._told.add(topic)
-            print(f"saccade: camera: a message is left out: {text}", file=sys.stderr, flush=True)
 
     def _is_ready(self, waiting: _Waiting) -> bool:
         choice = self.choice
