@@ -50,7 +50,8 @@ def endpoint():
 
 
 def config_of(endpoint, source=f"ros:{IMAGE}", **values):
-    return Config().with_values({"ros.router": endpoint, "camera.source": source, "camera.rate_hz": 100, **values})
+    return Config().with_values({"ros.router": endpoint, "camera.source": source, "camera.rate_hz": 100,
+                                 "camera.world_frame": WORLD, **values})
 
 
 class CameraNode:
@@ -144,14 +145,27 @@ class Script:
     dropped = 0
 
     def __init__(self, silent):
-        self._silent, self._periods = silent, itertools.count()
+        self._silent, self.count = silent, 0
         self._raws = [Raw(topic, message.__msgtype__, ros.cdr(message), time_ns)
                       for topic, time_ns, message in ros.plain(100, HERE)]
 
     def heard(self, _timeout_s):
-        k = next(self._periods)
+        k, self.count = self.count, self.count + 1
         period = self._raws[:4] if k == 0 else self._raws[3 * k + 1:3 * k + 4]
         return [raw for raw in period if k < 3 or raw.topic != self._silent]
+
+
+def test_the_root_of_tf_is_chosen_when_all_of_it_was_heard():
+    """The fixed transform is there at once, the one above it some periods later."""
+    class Late(Script):
+        def heard(self, timeout_s):
+            raws = super().heard(timeout_s)
+            return raws if self.count > 8 else [raw for raw in raws if raw.topic != TF]
+
+    for camera in (Config().camera, config_of("x").camera):
+        chooser, clock = Chooser("here", camera), itertools.count(0, 0.1)
+        choice = live._chosen(chooser, Late(""), IMAGE, lambda clock=clock: next(clock))
+        assert choice.path == (WORLD, "base", OPTICAL)
 
 
 @pytest.mark.parametrize(("silent", "words", "without_pose"), [

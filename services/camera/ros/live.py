@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     import zenoh
 
 FOUND_S = 10.0  # how long to wait for an image, its CameraInfo and a transform
+SETTLED_S = 1.0  # how long the root of tf must be heard of
 SILENT_S = 5.0  # after this time without an image the topic counts as ended
 LOOK_S = 0.1
 MOST_HELD, MOST_HELD_BYTES = 10_000, 2 * MAX_MESSAGE_BYTES  # of messages that have arrived and are not worked off
@@ -130,14 +131,26 @@ def open_live_source(topic: str, camera: CameraConfig, ros: RosConfig) -> tuple[
     return source, poses, f"ROS at {ros.router}: {choice.told}"
 
 
-def _chosen(chooser: Chooser, ears: Ears, topic: str) -> Choice:
-    """Waits until it is clear what to take. Raises SaccadeError if it is not after FOUND_S."""
-    deadline_s = time.monotonic() + FOUND_S
-    while time.monotonic() < deadline_s:
+def _chosen(chooser: Chooser, ears: Ears, topic: str, clock: Callable[[], float] = time.monotonic) -> Choice:
+    """Waits until it is clear what to take. Raises SaccadeError if it is not after FOUND_S.
+
+    The root of tf is known only when all its parts were heard. So it waits longer if the world's frame is not given,
+    and longer still if there are no intrinsics, or if no transform moves the camera.
+    """
+    camera, begun_s = chooser.camera, clock()
+    found_s: float | None = None
+    while clock() - begun_s < FOUND_S:
         for raw in ears.heard(LOOK_S):
             chooser.take(raw)
-        if chooser.complete and (chooser.infos or time.monotonic() > deadline_s - FOUND_S / 2):
-            return chooser.choose()
+        try:
+            choice = chooser.choose()
+        except SaccadeError:
+            continue
+        found_s = clock() if found_s is None else found_s
+        lacks = not choice.moves or (choice.lens is None and camera.intrinsics_px is None)
+        settled_s = FOUND_S / 2 if lacks else 0.0 if camera.world_frame else SETTLED_S
+        if clock() - found_s >= settled_s:
+            return choice
     if not chooser.images and not chooser.undecodable:
         raise SaccadeError(f"{ROS_PREFIX}{topic} gives no image: is its name right, does its node run with rmw_zenoh, "
                            f"and is this its router and domain (ros.router, ros.domain)? {chooser.seen} other "
