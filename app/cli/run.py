@@ -51,7 +51,8 @@ def run(*, objects: Objects = None, names: Names = None, scenes: ScenesFile = No
         world: Annotated[str, typer.Option(
             help="Where images come from: simulator, or camera for a real one.")] = "simulator",
         source: Annotated[str | None, typer.Option(
-            help="Images of a real camera: a folder, a video file, or a webcam (webcam:0).")] = None,
+            help="Images of a real camera: a folder, a video file, a ROS 2 bag, a webcam (webcam:0), or a topic of "
+                 "ROS 2 (ros:/camera/image_raw).")] = None,
         poses: Annotated[Path | None, typer.Option(
             help="File or folder with the camera's poses, such as TUM, transforms.json or COLMAP.")] = None,
         intrinsics: Annotated[str | None, typer.Option(
@@ -64,6 +65,14 @@ def run(*, objects: Objects = None, names: Names = None, scenes: ScenesFile = No
             metavar="FILE|NAME")] = None,
         rate: Annotated[float | None, typer.Option(
             help="Images per second, of a folder or a webcam.", show_default="10")] = None,
+        image_topic: Annotated[str | None, typer.Option(
+            help="Topic of the images in a ROS 2 bag.", show_default="the one that has a CameraInfo")] = None,
+        camera_frame: Annotated[str | None, typer.Option(
+            help="Frame of the camera in the tf of ROS 2.", show_default="that of the images")] = None,
+        world_frame: Annotated[str | None, typer.Option(
+            help="Frame of tf that is the agent's world.", show_default="the root of tf")] = None,
+        ros: Annotated[bool, typer.Option(
+            "--ros", help="Publish the chosen viewpoint and the beliefs to ROS 2.")] = False,
         loop: Annotated[bool, typer.Option("--loop", help="Begin again with the first image after the last.")] = False,
         config: ConfigFile = None, values: Values = None,
         view: Annotated[bool, typer.Option("--view", help="Show the run in a browser while it goes on.")] = False,
@@ -85,7 +94,9 @@ def run(*, objects: Objects = None, names: Names = None, scenes: ScenesFile = No
              "scene.explore": explore or None, "bus.kind": bus,
              "perception.weights": weights, "camera.source": source, "camera.poses": poses, "camera.board": board,
              "camera.calibration": calibration,
-             "camera.intrinsics_px": numbers(intrinsics), "camera.rate_hz": rate, "camera.loop": loop or None}
+             "camera.intrinsics_px": numbers(intrinsics), "camera.rate_hz": rate, "camera.loop": loop or None,
+             "camera.image_topic": image_topic, "camera.camera_frame": camera_frame,
+             "camera.world_frame": world_frame, "ros.publish": ros or None}
     console = Console()
 
     def show(finished: Finished) -> None:

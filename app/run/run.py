@@ -22,7 +22,7 @@ from saccade.app.run.supervisor import VIEWER
 from saccade.services.camera.calibration import calibration_path
 from saccade.services.camera.core import build as build_camera
 from saccade.services.camera.core import require_one_of_each
-from saccade.services.camera.sources import absolute, webcam_number
+from saccade.services.camera.sources import absolute, is_live
 from saccade.services.recorder.core import describe, to_be_finished
 from saccade.services.viewer.server import binary, url_of, with_free_ports
 from saccade.shared.bus.messages import Message, Result
@@ -65,7 +65,9 @@ def run(config: Config, *, agent: str, out: Path | None, plain: bool, console: C
     require_weights(agent, config)
     if view:
         config = to_be_viewed(config)
-    processes = agent_processes(agent, world, view=view) if config.bus.kind == "zenoh" else ()
+    if config.ros.publish and config.bus.kind != "zenoh":
+        raise SaccadeError("ros.publish is for services on the bus: leave `--bus local` out")
+    processes = agent_processes(agent, world, view=view, ros=config.ros.publish) if config.bus.kind == "zenoh" else ()
     folder = _new_folder(out or Path("runs") / f"{time.strftime('%Y%m%d-%H%M%S')}-{config.seed}")
     lacks: list[str] = []
     ended = None  # stays None if the run is interrupted: then no viewer stays
@@ -120,8 +122,8 @@ def in_world(config: Config, world: str) -> Config:
     from_outside = config.services.source is not None
     if not from_outside:
         require_one_of_each(camera)
-    if not from_outside and (camera.source is None or webcam_number(camera.source) is None):
-        build_camera(config)  # not for a webcam, because this would switch it on and off
+    if not from_outside and (camera.source is None or not is_live(camera.source)):
+        build_camera(config)  # not for what is live: this would switch a webcam on and off
     return config
 
 
@@ -179,6 +181,8 @@ def run_here(config: Config, agent: str, folder: Path, display: Display, world: 
                 log.close()
             if left_out := getattr(source, "skipped", 0):
                 display.note(f"{left_out} images without a pose were left out")
+            if unusable := getattr(source, "refused", 0):
+                display.note(f"{unusable} messages that cannot be used were left out")
     return display.progress.results
 
 

@@ -59,6 +59,8 @@ def _camera_lines(config: Config, progress: Progress) -> list[str]:
     told = [f"{views} view{'' if views == 1 else 's'}"]
     if without_pose:
         told.append(f"{without_pose} images without a pose were left out")
+    if "camera" in progress.statuses and (unusable := progress.statuses["camera"].refused):
+        told.append(f"{unusable} messages that cannot be used were left out")
     lines = ["; ".join(told + [f"{name} skipped {count}" for name, count in skipped.items()])]
     goal_image = config.scene.goal_image
     if config.scene.explore or goal_image is None:

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from saccade.services.camera.calibration import read_calibration
 from saccade.services.camera.charuco import read_board
 from saccade.services.camera.poses import Poses, asked_of, read_poses
+from saccade.services.camera.ros.source import RosSource, is_ros, open_ros_source
+from saccade.services.camera.ros.stream import with_lens
 from saccade.services.camera.sources import Folder, Source, SourceImage, open_source
 from saccade.services.camera.trajectories.lens import Lens
 from saccade.services.camera.virtual_camera import VirtualCamera
@@ -29,6 +31,8 @@ if TYPE_CHECKING:
     from saccade.services.camera.board_poses import BoardPoses
 
 SERVICE = Service("camera", inputs=(ACTION,), trigger=ACTION, outputs=(FRAME, GOAL))
+BOARD_NEEDS = ("camera.board needs the camera's intrinsics: calibrate it with `saccade calibrate` and give "
+               "camera.calibration, or give camera.intrinsics_px")
 WHOLE = 0.995  # share of the networks' field of view; if the camera covers less, the user is told
 
 
@@ -36,9 +40,10 @@ class Camera:
     """Turns the images of a source into frames like those of the training, with INTRINSICS_PX and their poses.
 
     All images belong to one episode. A camera that is started again within a run begins another episode. The caller
-    asks for the next frame every `period_s` seconds. Images without a pose are left out and counted in `skipped`. With
-    `loop` the source begins anew when it has ended. `goal_rgb` is the goal image [480, 480, 3]; without it the agent
-    explores. `notes` tells the user what is assumed, one line for each assumption.
+    asks for the next frame every `period_s` seconds. Images without a pose are left out and counted in `skipped`, and
+    messages of a ROS source that cannot be used in `refused`. With `loop` the source begins anew when it has ended.
+    `goal_rgb` is the goal image [480, 480, 3]; without it the agent explores. `notes` tells the user what is assumed,
+    one line for each assumption.
     """
 
     episodes = 1
@@ -48,6 +53,11 @@ class Camera:
         self.source, self.poses, self.virtual_camera = source, poses, virtual_camera
         self.goal_rgb, self.loop, self.notes = goal_rgb, loop, notes
         self.period_s, self.skipped = source.period_s, 0
+
+    @property
+    def refused(self) -> int:
+        """How many messages of the source could not be used."""
+        return getattr(self.source, "left_out", 0)
 
     def begin(self, run: str, episode: int) -> list[Output]:
         """Returns the goal and the first frame. Raises SaccadeError if no image has a pose."""
@@ -99,15 +109,18 @@ def build(config: Config) -> Camera:
     camera = config.camera
     require_one_of_each(camera)
     if camera.source is None:
-        raise SaccadeError("camera.source is not given: give a folder of images, a video file, or a webcam (webcam:0)")
-    source = open_source(camera.source, rate_hz=camera.rate_hz)
-    poses = Poses.still(start_pose()) if camera.poses is None else read_poses(camera.poses, asked=asked_of(camera))
+        raise SaccadeError("camera.source is not given: give a folder of images, a video file, a ROS 2 bag, or "
+                           "a webcam (webcam:0)")
+    ros = open_ros_source(config)
+    source = ros.source if ros else open_source(camera.source, rate_hz=camera.rate_hz)
+    poses = _poses_of(config, ros)
     poses = poses.matched([path.name for path in getattr(source, "paths", ())])
     lens, told = _lens(camera, poses, source.size_px)
     virtual_camera = VirtualCamera(source.size_px, lens=lens)
     goal = _goal_of(config, virtual_camera)
-    assumed = _notes(config, virtual_camera, lens)
-    notes = (*poses.notes, *told, *assumed, *((goal.note,) if goal else ()))
+    still = ros is None and camera.poses is None and camera.board is None
+    assumed = _notes(virtual_camera, lens, still=still)
+    notes = (*((ros.told,) if ros else ()), *poses.notes, *told, *assumed, *((goal.note,) if goal else ()))
     return Camera(source, _by_board(camera, source, lens) or poses, virtual_camera,
                   goal_rgb=goal.rgb if goal else None, loop=camera.loop, notes=notes)
 
@@ -118,22 +131,22 @@ def require_one_of_each(camera: CameraConfig) -> None:
         raise SaccadeError("camera.board and camera.poses both tell the camera's poses: give one of them")
     if camera.calibration is not None and camera.intrinsics_px is not None:
         raise SaccadeError("camera.calibration and camera.intrinsics_px both tell the intrinsics: give one of them")
-    if camera.board is not None and camera.calibration is None and camera.intrinsics_px is None:
-        raise SaccadeError("camera.board needs the camera's intrinsics: calibrate it with `saccade calibrate` and give "
-                           "camera.calibration, or give camera.intrinsics_px")
+    given = camera.calibration is not None or camera.intrinsics_px is not None
+    if camera.board is not None and not given and not is_ros(camera.source or ""):  # ROS may tell them
+        raise SaccadeError(BOARD_NEEDS)
 
 
 def _lens(camera: CameraConfig, poses: Poses, size_px: Size) -> tuple[Lens | None, tuple[str, ...]]:
-    """The lens of the images, and notes about it: what the user gives, else what the file of the poses tells. None if
-    nothing is known."""
+    """The lens of the images, and notes about it: what the user gives, else what the file of the poses or a
+    CameraInfo tells. None if nothing is known."""
     if camera.calibration is not None:
         read = read_calibration(camera.calibration)
-        lens = read.lens.at(size_px, "the calibration's")
+        lens = read.lens.at(size_px, "the calibration")
         told = f"intrinsics ({', '.join(f'{x:.2f}' for x in lens.of(size_px))}) px are those of the calibration"
         return lens, (f"{told} {camera.calibration}", *_removed(lens))
     if camera.intrinsics_px is not None:
         kept = any(lens.distorts for lens in poses.lenses)
-        note = "the distortion that the poses' file tells of is not removed, because camera.intrinsics_px is given"
+        note = f"the distortion that {poses.lens_from} tells of is not removed, because camera.intrinsics_px is given"
         return Lens(camera.intrinsics_px, size_px), (note,) if kept else ()
     found, notes = poses.lens(size_px)
     return found, (*notes, *_removed(found))
@@ -144,9 +157,12 @@ def _removed(lens: Lens | None) -> tuple[str, ...]:
 
 
 def _by_board(camera: CameraConfig, source: Source, lens: Lens | None) -> BoardPoses | None:
-    """The poses from a board, None if there is none. Images of a folder may be taken far from one another."""
-    if camera.board is None or lens is None:
+    """The poses from a board, None if there is none. Images of a folder may be taken far from one another. Raises
+    SaccadeError if nothing tells the intrinsics."""
+    if camera.board is None:
         return None
+    if lens is None:
+        raise SaccadeError(BOARD_NEEDS)
     from saccade.services.camera.board_poses import BoardPoses  # loads a filter that nothing else here needs
 
     return BoardPoses(read_board(camera.board), lens, camera.board, smooth=not isinstance(source, Folder))
@@ -170,7 +186,16 @@ def _goal_of(config: Config, virtual_camera: VirtualCamera) -> GoalImage | None:
     return read_goal_image(scene.goal_image, scene.goal_intrinsics_px)
 
 
-def _notes(config: Config, virtual_camera: VirtualCamera, lens: Lens | None) -> tuple[str, ...]:
+def _poses_of(config: Config, ros: RosSource | None) -> Poses:
+    """The poses of a file, else those of a ROS source, else the one of a camera that stands still."""
+    camera = config.camera
+    if camera.poses is None:
+        return ros.poses if ros else Poses.still(start_pose())
+    poses = read_poses(camera.poses, asked=asked_of(camera))
+    return with_lens(poses, ros.poses) if ros else poses
+
+
+def _notes(virtual_camera: VirtualCamera, lens: Lens | None, *, still: bool) -> tuple[str, ...]:
     """Texts for the user, one line each: what is assumed because it is not given, and whether grey is filled in."""
     notes = []
     if lens is None:
@@ -181,7 +206,7 @@ def _notes(config: Config, virtual_camera: VirtualCamera, lens: Lens | None) -> 
     if virtual_camera.coverage < WHOLE:
         notes.append(f"the camera covers {virtual_camera.coverage:.0%} of the networks' field of view: the rest is "
                      "grey, and objects there count as not seen")
-    if config.camera.poses is None and config.camera.board is None:
+    if still:
         x, y, z = start_pose()[:3, 3]
         notes.append(f"camera.poses is not given: the camera is assumed to stand still at ({x:.2f}, {y:.2f}, {z:.2f}) "
                      "m and to look at the table's centre; if it moves or stands elsewhere, the positions of objects "

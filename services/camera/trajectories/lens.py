@@ -41,22 +41,22 @@ class Lens:
         """Whether the lens differs from a pinhole."""
         return self.fisheye or any(value for _, value in self.distortion)
 
-    def of(self, size_px: Size, whose: str = "the poses'") -> Intrinsics:
+    def of(self, size_px: Size, told_by: str = "the poses' file") -> Intrinsics:
         """The intrinsics for images of `size_px`. Raises SaccadeError if those images have another shape."""
         if self.intrinsics_px is None:
             focal = size_px[0] / 2 / math.tan((self.angle_x_rad or 1.0) / 2)
             return focal, focal, size_px[0] / 2, size_px[1] / 2
         width, height = self.size_px or size_px
         if abs(size_px[0] * height / (size_px[1] * width) - 1) > SAME_SHAPE:
-            raise SaccadeError(f"{whose} intrinsics are for images of {width}x{height} pixels, the source has "
+            raise SaccadeError(f"the intrinsics of {told_by} are for images of {width}x{height} pixels, the source has "
                                f"{size_px[0]}x{size_px[1]}: give camera.intrinsics_px, or images of that shape")
         x, y = size_px[0] / width, size_px[1] / height
         fx, fy, cx, cy = self.intrinsics_px
         return fx * x, fy * y, cx * x, cy * y
 
-    def at(self, size_px: Size, whose: str = "the poses'") -> Lens:
+    def at(self, size_px: Size, told_by: str = "the poses' file") -> Lens:
         """The same lens for images of `size_px`. Raises SaccadeError as `of` does."""
-        return Lens(self.of(size_px, whose), size_px, self.distortion, self.fisheye)
+        return Lens(self.of(size_px, told_by), size_px, self.distortion, self.fisheye)
 
     def pixels(self, rays: Array) -> Array:
         """Pixels [N, 2] where the lens shows rays (x, y) [N, 2] at depth 1, y down. The intrinsics must be known."""
