@@ -101,4 +101,4 @@ def test_a_calibration_is_for_images_of_its_shape_in_any_size(tmp_path):
     camera = build(Config().with_values(given | {"camera.source": str(tmp_path / "240")}))
     assert any("intrinsics (305.00, 306.00, 162.50, 118.00) px are those of the calibration" in x for x in camera.notes)
     wrong = Config().with_values(given | {"camera.source": str(tmp_path / "320")})
-    assert "the calibration's intrinsics are for images of 640x480 pixels" in complaint(build, wrong)
+    assert "the intrinsics of the calibration are for images of 640x480 pixels" in complaint(build, wrong)

@@ -86,8 +86,8 @@ class Poses:
                        notes=(*self.notes, note))
 
     def lens(self, size_px: Size) -> tuple[Lens | None, tuple[str, ...]]:
-        """The lens that the file or a CameraInfo tells of, for images of this size (width, height), and notes. None if it tells none.
-        Raises SaccadeError if it is that of other images or of several cameras."""
+        """The lens that the file or a CameraInfo tells of, for images of this size (width, height), and notes. None if
+        it tells none. Raises SaccadeError if it is that of other images or of several cameras."""
         lens, note = one_lens(self.lenses)
         if lens is None:
             return None, ()

@@ -181,16 +181,16 @@ class Chooser:
         try:
             return lens_of(self.infos[info], rectified=is_rectified(topic))
         except RosError as error:
-            raise SaccadeError(f"{self.where}: {info}: {error}: give --intrinsics") from error
+            raise SaccadeError(f"{self.where}: {info}: {error}: give --intrinsics or --calibration") from error
 
     def _with_frames(self, choice: Choice, frame: str) -> Choice:
         """The choice with the frames between which the pose is taken: those of tf, or of a topic of poses."""
-        need = "give --camera-frame and --world-frame, or the poses in a file with --poses"
+        need = "give --camera-frame and --world-frame, or the poses with --poses or --board"
         try:
             camera = name_of(self.camera.camera_frame or frame)
         except RosError as error:
             raise SaccadeError(f"{self.where}: the images of {choice.image} name no frame: give --camera-frame, or the "
-                               "poses in a file with --poses") from error
+                               "poses with --poses or --board") from error
         tree, topic, root = self._tree_with_poses(camera)
         world = name_of(self.camera.world_frame) if self.camera.world_frame else tree.up(camera)[-1]
         path = tree.path(world, camera)
