@@ -11,7 +11,7 @@ from PIL import Image
 from saccade.services.camera.calibration import Calibration, read_calibration
 from saccade.services.camera.core import build
 from saccade.shared.config import Config
-from saccade.tests.fakes.board import FISHEYE, PINHOLE, SHEET, printed, seen, view
+from saccade.tests.fakes.board import FISHEYE, PINHOLE, SHEET, seen, view
 from saccade.tests.front_door import call
 from saccade.tests.hostile import complaint
 
@@ -23,9 +23,9 @@ SIZE_PX, INTRINSICS = "size_px = [640, 480]", "intrinsics_px = [600, 600, 320, 2
 def taken(folder, poses, camera):
     """A folder with an image of the board from each pose, with noise, and the board's description."""
     (folder / "f").mkdir()
-    rng, sheet = np.random.default_rng(0), printed()
+    rng = np.random.default_rng(0)
     for k, pose in enumerate(poses):
-        noisy = seen(pose, camera, sheet=sheet) + rng.normal(0, 3, (480, 640, 3))
+        noisy = seen(pose, camera) + 3 * rng.standard_normal((480, 640, 3), np.float32)
         Image.fromarray(np.clip(noisy, 0, 255).astype(np.uint8)).save(folder / "f" / f"{k}.png")
     (folder / "board.json").write_text(json.dumps(SHEET.model_dump(mode="json")))
     return folder

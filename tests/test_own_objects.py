@@ -55,8 +55,28 @@ def added(objects, *names):
         keep(own_folder(objects), mesh_of(number, name), Card(f"{name}.obj", "m", "z", ("It was made by code.",)))
 
 
-def test_a_set_is_named_or_its_folder_is_given(home):
-    added("my", "tea", "rice")
+@pytest.fixture(scope="module")
+def learnt_once(tmp_path_factory):
+    """A set of two objects that is learnt, for all tests of this file."""
+    from rich.console import Console
+
+    folder = tmp_path_factory.mktemp("learnt")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SACCADE_OBJECTS", str(folder))
+        added("my", "tea", "rice")
+        learn_set("my", Console(quiet=True))
+    return folder / "my"
+
+
+@pytest.fixture
+def learnt(home, learnt_once):
+    """The home with a copy of that set, which a test may change."""
+    shutil.copytree(learnt_once, home / "my")
+    return home
+
+
+def test_a_set_is_named_or_its_folder_is_given(learnt):
+    home = learnt
     assert names_of("my") == ("rice", "tea")
     assert names_of(str(home / "my")) == ("rice", "tea")
     assert SceneConfig(objects=str(home / "other" / ".." / "my")).objects == str(home / "my")
@@ -145,9 +165,8 @@ def test_what_is_added_is_learnt_and_leaves_the_others_as_they_were(home, consol
     assert "learnt oil: 3 objects in" in text
 
 
-def test_what_changed_is_learnt_again_and_what_is_removed_is_forgotten(home, console):
-    added("my", "tea", "rice")
-    learn_set("my", console)
+def test_what_changed_is_learnt_again_and_what_is_removed_is_forgotten(learnt, console):
+    home = learnt
     folder = learned_folder("my", OPEN)
     first = (folder / "tea.bank.safetensors").read_bytes()
     shutil.rmtree(home / "my" / "tea")
@@ -187,9 +206,7 @@ def test_meshes_are_added_and_learnt_and_a_bad_one_does_not_stop_the_others(home
 
 
 @pytest.mark.parametrize("damage", ["bank", "manifest", "hashes", "gone"])
-def test_what_was_learnt_and_is_damaged_is_learnt_again(home, console, damage):
-    added("my", "tea", "rice")
-    learn_set("my", console)
+def test_what_was_learnt_and_is_damaged_is_learnt_again(learnt, console, damage):
     folder = learned_folder("my", OPEN)
     right = {path.name: path.read_bytes() for path in folder.glob("*.safetensors")}
     if damage == "bank":
@@ -238,11 +255,12 @@ def test_who_says_no_adds_nothing(home, console, tmp_path):
     assert "cup is not added: --unit, --up and --symmetry say how the file is meant" in console.export_text()
 
 
-def test_a_set_is_listed_and_an_object_is_shown(home, console):
-    added("my", "tea", "rice")
+def test_a_set_is_listed_and_an_object_is_shown(learnt, console):
+    learned = learned_folder("my", OPEN)
+    shutil.move(learned, learnt / "aside")
     list_set("my", console)
     show_object("my", "tea", console)
-    learn_set("my", console)
+    shutil.move(learnt / "aside", learned)
     show_object("my", "tea", console)
     text = console.export_text()
     assert text.count('source = "tea.obj"') == 2
@@ -279,9 +297,8 @@ def test_listed_objects_of_several_sets_are_one_set(home, tmp_path, monkeypatch)
     ("my:rice,other:rice", "object 'rice' is listed twice"),
     ("my:oil", "object 'oil' is not in 'my': choose from rice, tea"),
     ("none:oil", "object set 'none' is not there"), (",", "lists nothing: write NAME,SET:NAME,SET")])
-def test_a_list_that_cannot_be_is_one_line(home, objects, words):
-    added("my", "tea", "rice")
-    added("other", "rice")
+def test_a_list_that_cannot_be_is_one_line(learnt, objects, words):
+    shutil.copytree(learnt / "my" / "rice", learnt / "other" / "rice")
     with pytest.raises(SaccadeError, match=words):
         members_of(objects)
 

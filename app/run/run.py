@@ -17,7 +17,7 @@ from rich.console import Console
 from saccade.app.run.display import Display, say
 from saccade.app.run.launch import launched
 from saccade.app.run.registry import DEFAULT_WORLD, agent_of, agent_processes, local_pairs, require_services, world_of
-from saccade.app.run.summary import summary
+from saccade.app.run.summary import summary, unusable_line
 from saccade.app.run.supervisor import VIEWER
 from saccade.services.camera.calibration import calibration_path
 from saccade.services.camera.core import build as build_camera
@@ -182,7 +182,7 @@ def run_here(config: Config, agent: str, folder: Path, display: Display, world: 
             if left_out := getattr(source, "skipped", 0):
                 display.note(f"{left_out} images without a pose were left out")
             if unusable := getattr(source, "refused", 0):
-                display.note(f"{unusable} messages that cannot be used were left out")
+                display.note(unusable_line(unusable))
     return display.progress.results
 
 

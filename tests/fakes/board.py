@@ -21,9 +21,10 @@ SAMPLES = 2  # on each side of a pixel
 MARGIN_M = 0.01
 
 
+@cache
 def printed(board: Board = SHEET) -> np.ndarray:
     """The sheet as grey values [H, W] from 0 to 1, with a white margin."""
-    return grey_of(board, texels_per_m=TEXELS_PER_M, margin_m=MARGIN_M) / 255
+    return grey_of(board, texels_per_m=TEXELS_PER_M, margin_m=MARGIN_M).astype(np.float32) / 255
 
 
 def seen(world_from_camera, camera=PINHOLE, board: Board = SHEET, sheet: np.ndarray | None = None) -> np.ndarray:
@@ -32,13 +33,14 @@ def seen(world_from_camera, camera=PINHOLE, board: Board = SHEET, sheet: np.ndar
 
     sheet = printed(board) if sheet is None else sheet
     (width, height), rays = camera.size_px, _rays(camera)
-    towards = np.stack([rays[:, 0], -rays[:, 1], -np.ones(len(rays))], axis=1) @ world_from_camera[:3, :3].T
-    far = np.where(towards[:, 2] < 0, world_from_camera[2, 3] / -towards[:, 2], np.nan)
-    x, y = (world_from_camera[:2, 3] + far[:, None] * towards[:, :2]).T
+    turn, eye = world_from_camera[:3, :3].astype(np.float32), world_from_camera[:3, 3].astype(np.float32)
+    towards = np.stack([rays[:, 0], -rays[:, 1], -np.ones(len(rays), np.float32)], axis=1) @ turn.T
+    far = np.where(towards[:, 2] < 0, eye[2] / -towards[:, 2], np.float32(np.nan))
+    x, y = (eye[:2] + far[:, None] * towards[:, :2]).T
     half = board.size_m / 2 + MARGIN_M
     places = np.stack([x + half[0], half[1] - y], axis=1) * TEXELS_PER_M - 0.5
     places = np.nan_to_num(places, nan=-1e4).astype(np.float32).reshape(height * SAMPLES, width * SAMPLES, 2)
-    fine = cv2.remap(sheet.astype(np.float32), places, None, cv2.INTER_LINEAR, borderValue=0.55)
+    fine = cv2.remap(sheet, places, None, cv2.INTER_LINEAR, borderValue=0.55)
     grey = 30 + 200 * fine.reshape(height, SAMPLES, width, SAMPLES).mean((1, 3))
     return np.repeat(grey.round().astype(np.uint8)[..., None], 3, axis=2)
 
@@ -47,7 +49,7 @@ def seen(world_from_camera, camera=PINHOLE, board: Board = SHEET, sheet: np.ndar
 def _rays(camera) -> np.ndarray:
     """The rays [N, 2] of all samples of an image."""
     u, v = ((np.arange(count * SAMPLES) + 0.5) / SAMPLES for count in camera.size_px)
-    return camera.rays(np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2))
+    return camera.rays(np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)).astype(np.float32)
 
 
 def view(azimuth_deg: float, elevation_deg: float, range_m: float = 0.5, roll_deg: float = 0.0, at=(0.0, 0.0)):
