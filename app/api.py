@@ -23,10 +23,10 @@ from rich.console import Console
 from saccade.app.log.episodes import Log
 from saccade.app.run.agent import Agent as _Agent
 from saccade.app.run.agent import image_of
-from saccade.app.run.registry import DEFAULT_AGENT, DEFAULT_WORLD, agent_of
+from saccade.app.run.registry import DEFAULT_WORLD, configuration
 from saccade.app.run.run import run as _run
 from saccade.shared.bus.messages import Result
-from saccade.shared.config import Config, load
+from saccade.shared.config import Config
 from saccade.shared.errors import SaccadeError, told
 
 # Several keys end in these words, or the option of the command line has this name: this is the key that is meant
@@ -53,14 +53,14 @@ class Run:
         return Log(self.path)
 
 
-def run(*, goal: str | Path | ArrayLike | None = None, agent: str = DEFAULT_AGENT, world: str = DEFAULT_WORLD,
+def run(*, goal: str | Path | ArrayLike | None = None, agent: str | None = None, world: str = DEFAULT_WORLD,
         out: str | Path | None = None, config: str | Path | None = None, show: bool = False, **values: Any) -> Run:
     """Runs an agent like the command `saccade run`, and returns when all its episodes are over.
 
     `goal` is an image to find: a file, or an array [H, W, 3] of uint8; `goal_intrinsics_px` are its (fx, fy, cx, cy).
     Without it the goal comes from the simulator's scene, and with a real camera the agent explores. `config` is a
     configuration file or the name of a preset; the other keywords override its values. `out` is a new folder for the
-    run, by default `runs/<time>-<seed>`.
+    run, by default `runs/<time>-<seed>`. Without `agent` it is `sceneccn`, or `open` for a set of your own.
     With `show` the progress is printed. Raises SaccadeError if something is wrong that the user can repair.
     """
     from saccade.app.look.picture import draw_run  # here, so that matplotlib is only loaded when it is needed
@@ -68,8 +68,8 @@ def run(*, goal: str | Path | ArrayLike | None = None, agent: str = DEFAULT_AGEN
     with tempfile.TemporaryDirectory() as folder:
         goal_file = None if goal is None else _file_of(goal, Path(folder))
         keys = keys_of(values) | ({} if goal_file is None else {"scene.goal_image": goal_file})
-        resolved = load(_path(config, "config"), agent_of(agent).preset).with_values(keys)
-        finished = _run(resolved, agent=agent, world=world, out=_path(out, "out"), plain=True,
+        resolved, name = configuration(_path(config, "config"), keys, agent)
+        finished = _run(resolved, agent=name, world=world, out=_path(out, "out"), plain=True,
                         console=Console(quiet=not show))
     draw_run(finished.folder)
     return Run(finished.folder, finished.config, tuple(finished.results))
@@ -89,15 +89,14 @@ class Agent(_Agent):
 
     `goal` is the image to reach: a file, or an array [H, W, 3] of uint8. Without a goal the agent explores.
     `intrinsics` are (fx, fy, cx, cy) of your images, in pixels. Without them, an image of 480x480 pixels is taken as an
-    image of the training's camera, and of any other image the central square is used. Raises SaccadeError if the
-    configuration or the goal cannot be used.
+    image of the training's camera, and of any other image the central square is used. Without `agent` it is `sceneccn`,
+    or `open` for a set of your own. Raises SaccadeError if the configuration or the goal cannot be used.
     """
 
     def __init__(self, *, goal: str | Path | ArrayLike | None = None, intrinsics: Sequence[float] | None = None,
-                 agent: str = DEFAULT_AGENT, config: str | Path | None = None, **values: Any) -> None:
-        preset = agent_of(agent).preset
-        resolved = load(_path(config, "config"), preset).with_values(keys_of(values))
-        super().__init__(resolved, agent=agent, goal=goal, intrinsics=intrinsics)
+                 agent: str | None = None, config: str | Path | None = None, **values: Any) -> None:
+        resolved, name = configuration(_path(config, "config"), keys_of(values), agent)
+        super().__init__(resolved, agent=name, goal=goal, intrinsics=intrinsics)
 
 
 def keys_of(values: dict[str, Any]) -> dict[str, Any]:

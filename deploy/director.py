@@ -26,7 +26,7 @@ from saccade.app.cli.texts import configured, numbers
 from saccade.app.run.display import LINE_EVERY, Progress, line, say
 from saccade.app.run.follow import Messages, follow
 from saccade.app.run.launch import resolve
-from saccade.app.run.registry import AGENTS, DEFAULT_AGENT, DEFAULT_WORLD, WORLDS, agent_processes, world_of
+from saccade.app.run.registry import AGENTS, DEFAULT_WORLD, WORLDS, agent_processes, world_of
 from saccade.app.run.summary import summary
 from saccade.app.run.supervisor import HUNG_S, Process
 from saccade.deploy.container import LATEST, OVER, ROUTER_S, heartbeat_file, runs_folder
@@ -51,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--endpoint", default="tcp/127.0.0.1:7447", help="the router's address, for the services")
     parser.add_argument("--listen", help="the address at which the router listens, if it is another one")
     parser.add_argument("--objects", default=None, help="object set: pantry, ycb")
-    parser.add_argument("--agent", default=DEFAULT_AGENT, help=f"one of {', '.join(AGENTS)}")
+    parser.add_argument("--agent", help=f"one of {', '.join(AGENTS)}; without it the one that knows the objects")
     parser.add_argument("--weights", default=None, help="a folder of weights, or its name in weights/")
     parser.add_argument("--seed", type=int, default=None)
     parser.add_argument("--count", type=int, default=None, help="number of scenes, one after the other")
@@ -77,9 +77,9 @@ def main(argv: Sequence[str] | None = None) -> None:
         if told.view_port:
             given |= {"viewer.address": "0.0.0.0", "viewer.port": told.view_port,
                       "viewer.data_port": told.view_data_port, "viewer.published": told.view_published}
-        config = configured(None, given, shlex.split(told.set), told.agent)
+        config, agent = configured(None, given, shlex.split(told.set), told.agent or None)
         config = config.with_values({"viewer.token": with_token(config.viewer).token})
-        direct(config, told.agent, told.world, told.worlds, runs_folder(), Console(width=200))
+        direct(config, agent, told.world, told.worlds, runs_folder(), Console(width=200))
     except SaccadeError as error:
         print(f"saccade: {error}", file=sys.stderr)
         sys.exit(EXIT_ERROR)

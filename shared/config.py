@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError,
 
 from saccade.shared.errors import SaccadeError, is_text, told
 from saccade.shared.files import MIB, parse_json, parse_toml, read_text, replace_whole, size_of, writing
-from saccade.shared.wording import MODULE, TOKEN, WORLD, plain_of
+from saccade.shared.wording import MODULE, ROS_NAME, TOKEN, WORLD, plain_of
 
 PACKAGE = Path(__file__).resolve().parent.parent  # the folder of `saccade`: in a checkout the repository
 PRESETS, WEIGHTS = PACKAGE / "shared" / "presets", PACKAGE / "weights"
@@ -143,7 +143,8 @@ class CameraConfig(Section):
     """A real camera instead of the simulator. For what you leave out, Saccade assumes a value and says so."""
 
     source: str | None = None
-    """A folder of images, a video file, or a webcam (`webcam:0`)."""
+    """A folder of images, a video file, a ROS 2 bag, a webcam (`webcam:0`), or a topic of ROS 2
+    (`ros:/camera/image_raw`)."""
     poses: Path | None = None
     """File or folder with the camera's poses, in one of the formats of the guide's page about the camera."""
     pose_convention: Literal["opengl", "opencv"] | None = None
@@ -162,10 +163,36 @@ class CameraConfig(Section):
     """Undo the `applied_transform` of a transforms.json."""
     intrinsics_px: tuple[Focal, Focal, FiniteFloat, FiniteFloat] | None = None
     """fx, fy, cx, cy of the source's images, in pixels."""
+    board: Path | None = None
+    """Description of a printed board on the table, which tells the camera's poses. `saccade board` writes it."""
+    calibration: str | None = None
+    """File that `saccade calibrate` wrote, or the name of a camera under which it is kept. It tells the intrinsics and
+    the distortion of the lens, which is removed."""
     rate_hz: float = Field(10.0, gt=0, le=1000)
     """Images per second from a folder or a webcam. A video has its own rate."""
     loop: bool = False
     """Begin again with the first image after the last."""
+    image_topic: str | None = None
+    """Topic of the images in a ROS 2 bag. Without it, the only one, or the only one that has a CameraInfo."""
+    pose_topic: str | None = None
+    """Topic of poses (PoseStamped or Odometry) of ROS 2. Without it, one that is needed beside tf."""
+    camera_frame: str | None = None
+    """Frame of the camera in the tf of ROS 2: z points forward, y down. Without it, that of the images."""
+    world_frame: str | None = None
+    """Frame of tf that is the agent's world: z points up, the table's top is at z = 0. Without it, the root of tf."""
+
+
+class RosConfig(Section):
+    """ROS 2 nodes whose middleware is `rmw_zenoh`."""
+
+    router: str = "tcp/127.0.0.1:7447"
+    """Address of the Zenoh router of ROS 2."""
+    domain: int = Field(0, ge=0, le=232)
+    """Domain of ROS 2 (ROS_DOMAIN_ID)."""
+    publish: bool = False
+    """Publish the chosen viewpoint and the beliefs to ROS 2."""
+    namespace: str = Field("/saccade", pattern=ROS_NAME)
+    """Namespace of the topics that are published: `viewpoint` and `beliefs`."""
 
 
 class PerceptionConfig(Section):
@@ -279,6 +306,7 @@ class Config(Section):
     belief: BeliefConfig = BeliefConfig()
     planner: PlannerConfig = PlannerConfig()
     viewer: ViewerConfig = ViewerConfig()
+    ros: RosConfig = RosConfig()
     services: ServicesConfig = ServicesConfig()
 
     @property

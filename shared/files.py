@@ -6,6 +6,7 @@ is refused.
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
@@ -141,8 +142,18 @@ def writing(path: Path, what: str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise SaccadeError(f"{what} {path} cannot be written ({error.strerror or error}): free some space, or name a "
-                           "place where you may write") from error
+        raise SaccadeError(f"{what} {path} cannot be written ({error.strerror or error}): {remedy(error)}") from error
+
+
+def remedy(error: OSError) -> str:
+    """What a user can do where something could not be written."""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        return "free some space, or name another place"
+    if error.errno in (errno.EACCES, errno.EPERM):
+        return "give yourself the permission to write there, or name a place where you may write"
+    if error.errno == errno.EROFS:
+        return "name a place that is not read-only"
+    return "name another place"
 
 
 def append_line(path: Path, line: str) -> None:

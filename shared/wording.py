@@ -27,10 +27,12 @@ _NEEDED = {
 MODULE = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*$"
 WORLD = r"^[A-Za-z0-9_-]{1,64}$"
 TOKEN = r"^[A-Za-z0-9_-]{16,128}$"
+ROS_NAME = r"^(/[A-Za-z_][A-Za-z0-9_]*)+$"
 _FORMS = {
     MODULE: "give the name of a Python module, such as my_package.my_module",
     WORLD: "give at most 64 letters, digits, - and _",
     TOKEN: "give 16 to 128 letters, digits, - and _",
+    ROS_NAME: "give a name of ROS, such as /saccade",
 }
 
 

@@ -183,14 +183,20 @@ def test_interrupted_run_is_taken_up_again_with_the_same_outcome(tmp_path, monke
     assert first == second
 
 
-def test_results_of_another_run_are_not_mixed_in(tmp_path):
-    """Another seed, other scenes or another agent: a line that names the file and what differs."""
+def test_results_of_another_run_are_not_mixed_in(tmp_path, monkeypatch):
+    """Another seed, other scenes, or an object whose card tells another symmetry: a line that names the file and what
+    differs."""
     plan = prepare("oracle", Config(), tmp_path / "o.json", limit=1)
     file = plan.config.scene.file
     bench_module._take_up(plan, bench_module.facts(plan, "c"))
     other = prepare("oracle", Config(seed=1, scene={"file": file}), plan.out, limit=1)
     with pytest.raises(SaccadeError, match=r"o\.json\.partial\.jsonl holds results of another run \(its config differ"):
         run_bench(other)
+    with monkeypatch.context() as patch:
+        patch.setattr(bench_module, "symmetries", lambda objects, names: {"rice_box": 2, "soup_can": 1})
+        assert bench_module.facts(plan, "c")["scenes"]["symmetry"] == {"rice_box": 2}
+        with pytest.raises(SaccadeError, match="its scenes differ"):
+            run_bench(plan)
     file.write_text(file.read_text().replace("yaw_rad", "yaw_rad", 1) + " ")
     with pytest.raises(SaccadeError, match="its scenes differ"):
         run_bench(plan)

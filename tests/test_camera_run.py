@@ -29,6 +29,8 @@ from saccade.shared.bus.topics import BELIEF, FRAME, GOAL, PERCEPT, PLAN, RESULT
 from saccade.shared.config import Config, load
 from saccade.shared.errors import SaccadeError
 from saccade.shared.log.reading import RunReader
+from saccade.tests.fakes import ros
+from saccade.tests.fakes.bags import grey
 from saccade.tests.fakes.camera import LENS_PX, film, folder_of, written
 from saccade.tests.fakes.camera import line as pose_line
 from saccade.tests.fakes.logs import so_far
@@ -211,15 +213,22 @@ def test_what_the_user_can_mend_is_one_line_and_code_2(monkeypatch, capsys, tmp_
 
 
 def test_images_without_a_pose_are_left_out_and_said(tmp_path):
-    folder_of(tmp_path / "f", ["a.png", "b.png", "c.png"])
-    poses = written(tmp_path / "p.jsonl", pose_line(image="b.png"))
-    config = Config().with_values({"camera.source": str(tmp_path / "f"), "camera.poses": str(poses)})
+    """And apart from them, how many messages of a bag could not be used."""
+    def messages():
+        for k in range(4):
+            time_ns = ros.FIRST_NS + k * ros.STEP_NS
+            message = ros.image(time_ns, grey(k))
+            yield ros.IMAGE, time_ns, (message.__msgtype__, ros.cdr(message)[:500]) if k == 2 else message
+    poses = written(tmp_path / "p.jsonl", pose_line(index=1))
+    source = ros.bag(tmp_path / "f", messages())
+    config = Config().with_values({"camera.source": str(source), "camera.poses": str(poses)})
     text = played(config.with_values({"bus.kind": "local"}), tmp_path / "local")
     assert "camera: camera.intrinsics_px is not given: " in text
-    assert "camera: 2 images without a pose were left out\n1 view\n" in text
+    assert ("camera: 2 images without a pose were left out\n"
+            "camera: 1 message that cannot be used was left out\n1 view\n") in text
     text = played(config, tmp_path / "bus")
     assert text.count("camera: camera.intrinsics_px is not given: ") == 1
-    assert "\n1 view; 2 images without a pose were left out\n" in text
+    assert "\n1 view; 2 images without a pose were left out; 1 message that cannot be used was left out\n" in text
 
 
 @pytest.mark.parametrize("bus", ["zenoh", "local"])

@@ -150,7 +150,8 @@ def test_options_go_before_the_file_and_set_before_all(tmp_path):
     """file < option < --set; a value that is not JSON is text."""
     (tmp_path / "c.toml").write_text('seed = 1\n[scene]\nobjects = "ycb"\nyaw = "fixed"\n[planner]\nstep_m = 0.01\n')
     given = {"seed": 2, "scene.objects": None}
-    config = texts.configured(tmp_path / "c.toml", given, ["planner.step_m=0.03"], "sceneccn")
+    config, agent = texts.configured(tmp_path / "c.toml", given, ["planner.step_m=0.03"], None)
+    assert agent == "sceneccn"
     assert (config.seed, config.scene.objects, config.scene.yaw, config.planner.step_m) == (2, "ycb", "fixed", 0.03)
     assert texts.parse_value('scene.names=["a"]') == ("scene.names", ["a"])
     assert texts.parse_value("bus.world=a=b") == ("bus.world", "a=b")

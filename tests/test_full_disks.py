@@ -177,15 +177,17 @@ def test_files_are_replaced_all_or_none(tmp_path, monkeypatch):
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {"a": b"1", "b": b"2"}
 
 
-@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS, errno.EACCES])
-def test_the_front_door_tells_what_no_command_has_told(monkeypatch, capsys, number):
+@pytest.mark.parametrize(("number", "words"), [
+    (errno.ENOSPC, "free some space, or name another place"), (errno.EROFS, "name a place that is not read-only"),
+    (errno.EACCES, "give yourself the permission to write there, or name a place where you may write")])
+def test_the_front_door_tells_what_no_command_has_told(monkeypatch, capsys, number, words):
     def fail(**_more):
         raise OSError(number, os.strerror(number), "/tmp/\x1b[31m")
 
     monkeypatch.setattr(cli, "command_of", lambda app: fail)
     code, _, err = call(monkeypatch, capsys)
     assert code == 2
-    assert err == f"saccade: /tmp/\\x1b[31m: {os.strerror(number)}: free some space, or name another place\n"
+    assert err == f"saccade: /tmp/\\x1b[31m: {os.strerror(number)}: {words}\n"
 
 
 def test_a_fault_of_ours_stays_a_fault(monkeypatch):

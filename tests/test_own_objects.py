@@ -10,13 +10,11 @@ from PIL import Image
 
 from saccade.app.cli.texts import configured, is_list
 from saccade.app.objects.adding import add_meshes, learn_set, remove_objects
-from saccade.app.objects.learning import likeness
+from saccade.app.objects.cards import TURNTABLE, Card
 from saccade.app.objects.lists import assembled, members_of
+from saccade.app.objects.page import own_likeness, pairs_of
 from saccade.app.objects.showing import list_set, show_object
 from saccade.app.objects.store import (
-    CARD,
-    TURNTABLE,
-    Card,
     alone_in,
     keep,
     name_from,
@@ -27,7 +25,8 @@ from saccade.app.objects.store import (
 from saccade.shared.config import WEIGHTS, Config, SceneConfig, learned_folder, set_folder
 from saccade.shared.errors import SaccadeError
 from saccade.shared.files import parse_toml
-from saccade.shared.model.bank import bank_of
+from saccade.shared.model.bank import bank_in, bank_of
+from saccade.shared.model.object_card import CARD
 from saccade.shared.model.weights import MANIFEST, OPEN, Weights, weights_in_use
 from saccade.shared.render.groceries import grocery
 from saccade.shared.render.mesh import read_obj
@@ -56,8 +55,28 @@ def added(objects, *names):
         keep(own_folder(objects), mesh_of(number, name), Card(f"{name}.obj", "m", "z", ("It was made by code.",)))
 
 
-def test_a_set_is_named_or_its_folder_is_given(home):
-    added("my", "tea", "rice")
+@pytest.fixture(scope="module")
+def learnt_once(tmp_path_factory):
+    """A set of two objects that is learnt, for all tests of this file."""
+    from rich.console import Console
+
+    folder = tmp_path_factory.mktemp("learnt")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SACCADE_OBJECTS", str(folder))
+        added("my", "tea", "rice")
+        learn_set("my", Console(quiet=True))
+    return folder / "my"
+
+
+@pytest.fixture
+def learnt(home, learnt_once):
+    """The home with a copy of that set, which a test may change."""
+    shutil.copytree(learnt_once, home / "my")
+    return home
+
+
+def test_a_set_is_named_or_its_folder_is_given(learnt):
+    home = learnt
     assert names_of("my") == ("rice", "tea")
     assert names_of(str(home / "my")) == ("rice", "tea")
     assert SceneConfig(objects=str(home / "other" / ".." / "my")).objects == str(home / "my")
@@ -137,17 +156,17 @@ def test_what_is_added_is_learnt_and_leaves_the_others_as_they_were(home, consol
     assert weights.networks.folder == WEIGHTS / OPEN
     assert len(bank_of("oil", weights.bank("oil")).pictures) > 100
     assert (folder / "oil.bank.safetensors").stat().st_size < 600_000
-    names, alike = likeness("my")
-    assert np.diag(alike) == pytest.approx(1.0, abs=0.01)
-    assert alike[names.index("tea"), names.index("oil")] < 0.95
+    banks = {name: bank_in(weights, name) for name in weights.names}
+    alike = {pair.other: pair.similar for pair in pairs_of("tea", banks)}
+    assert set(alike) == {"rice", "oil"}
+    assert 0.0 < max(alike.values()) < own_likeness(banks["tea"]) < 1.0
     text = console.export_text()
     assert "learnt rice, tea: 2 objects in" in text
     assert "learnt oil: 3 objects in" in text
 
 
-def test_what_changed_is_learnt_again_and_what_is_removed_is_forgotten(home, console):
-    added("my", "tea", "rice")
-    learn_set("my", console)
+def test_what_changed_is_learnt_again_and_what_is_removed_is_forgotten(learnt, console):
+    home = learnt
     folder = learned_folder("my", OPEN)
     first = (folder / "tea.bank.safetensors").read_bytes()
     shutil.rmtree(home / "my" / "tea")
@@ -183,13 +202,11 @@ def test_meshes_are_added_and_learnt_and_a_bad_one_does_not_stop_the_others(home
     assert Weights(learned_folder("my", OPEN)).names == ("tea",)
     text = console.export_text()
     assert "its picture is" in text
-    assert "use it with `--agent open --objects my`" in text
+    assert "use it with `--objects my`" in text
 
 
 @pytest.mark.parametrize("damage", ["bank", "manifest", "hashes", "gone"])
-def test_what_was_learnt_and_is_damaged_is_learnt_again(home, console, damage):
-    added("my", "tea", "rice")
-    learn_set("my", console)
+def test_what_was_learnt_and_is_damaged_is_learnt_again(learnt, console, damage):
     folder = learned_folder("my", OPEN)
     right = {path.name: path.read_bytes() for path in folder.glob("*.safetensors")}
     if damage == "bank":
@@ -235,14 +252,15 @@ def test_who_says_no_adds_nothing(home, console, tmp_path):
                ask=lambda question: bool(asked.append(question)), console=console)
     assert asked == ["Is cup right?"]
     assert not (home / "my" / "cup").exists()
-    assert "cup is not added: --unit and --up say how the file is meant" in console.export_text()
+    assert "cup is not added: --unit, --up and --symmetry say how the file is meant" in console.export_text()
 
 
-def test_a_set_is_listed_and_an_object_is_shown(home, console):
-    added("my", "tea", "rice")
+def test_a_set_is_listed_and_an_object_is_shown(learnt, console):
+    learned = learned_folder("my", OPEN)
+    shutil.move(learned, learnt / "aside")
     list_set("my", console)
     show_object("my", "tea", console)
-    learn_set("my", console)
+    shutil.move(learnt / "aside", learned)
     show_object("my", "tea", console)
     text = console.export_text()
     assert text.count('source = "tea.obj"') == 2
@@ -268,7 +286,8 @@ def test_listed_objects_of_several_sets_are_one_set(home, tmp_path, monkeypatch)
     assert assembled("pantry:soup_can, tea,other:oil", OPEN) == folder
     assert {path.name: path.stat().st_mtime_ns for path in Path(folder).iterdir()}.items() >= {
         name: when for name, when in before.items() if not name.startswith("weights")}.items()
-    config = configured(None, {"scene.objects": "tea,oil"}, None, "still")
+    config, agent = configured(None, {"scene.objects": "tea,oil"}, None, "still")
+    assert agent == "still"
     assert names_of(config.scene.objects) == ("oil", "tea")
 
 
@@ -278,9 +297,8 @@ def test_listed_objects_of_several_sets_are_one_set(home, tmp_path, monkeypatch)
     ("my:rice,other:rice", "object 'rice' is listed twice"),
     ("my:oil", "object 'oil' is not in 'my': choose from rice, tea"),
     ("none:oil", "object set 'none' is not there"), (",", "lists nothing: write NAME,SET:NAME,SET")])
-def test_a_list_that_cannot_be_is_one_line(home, objects, words):
-    added("my", "tea", "rice")
-    added("other", "rice")
+def test_a_list_that_cannot_be_is_one_line(learnt, objects, words):
+    shutil.copytree(learnt / "my" / "rice", learnt / "other" / "rice")
     with pytest.raises(SaccadeError, match=words):
         members_of(objects)
 

@@ -42,12 +42,13 @@ def test_the_camera_takes_intrinsics_from_the_file(tmp_path):
     np.testing.assert_allclose(poses_seen(camera), TRUE, atol=1e-6)
     assert any("are read as transforms.json" in note for note in camera.notes)
     assert any("intrinsics (305.00, 310.00, 162.50, 119.00) px" in note for note in camera.notes)
-    assert any("is not removed yet" in note for note in camera.notes)
+    assert any(note.endswith("pixels at the image's corner, is removed") for note in camera.notes)
     assert not any("intrinsics_px is not given" in note for note in camera.notes)
-    assert camera.virtual_camera.coverage == VirtualCamera((320, 240), (305, 310, 162.5, 119)).coverage
+    assert camera.virtual_camera.coverage == VirtualCamera((320, 240), lens=camera.poses.lens((320, 240))[0]).coverage
     assert camera.virtual_camera.coverage != VirtualCamera((320, 240)).coverage
     own = camera_of(images, path, intrinsics_px=[300, 300, 160, 120])
     assert not any(note.startswith("intrinsics") for note in own.notes)
+    assert any("is not removed, because camera.intrinsics_px is given" in note for note in own.notes)
     square = folder_of(tmp_path / "g", NAMES, size=(240, 240))
     assert "for images of 640x480 pixels" in complaint(camera_of, square, path)
 

@@ -7,14 +7,16 @@ import sys
 
 import pytest
 
-HEAVY = {"torch", "mujoco", "scipy", "filterpy", "cv2", "matplotlib", "typer", "rich"}
+HEAVY = {"torch", "mujoco", "scipy", "filterpy", "cv2", "matplotlib", "typer", "rich", "rosbags"}
 NEEDS = {
     "router": set(), "recorder": set(), "evaluator": set(),
     "simulator": {"mujoco"},
     "perception": {"torch"},
     "belief": {"filterpy", "scipy"},
     "planner": {"scipy"},
+    "camera": {"scipy"},
     "viewer": set(),
+    "ros": {"scipy"},
 }
 
 

@@ -34,7 +34,9 @@ from saccade.shared.errors import SaccadeError
 from saccade.shared.files import MIB, append_line, parse_json, read_text, replace_whole, writing
 from saccade.shared.log.provenance import commit
 from saccade.shared.loop.local import run_local
+from saccade.shared.model.object_card import symmetries
 from saccade.shared.render.objects import names_in_use
+from saccade.shared.world.symmetry import NONE
 
 MAX_FILE_BYTES = 256 * MIB  # of results: some hundred thousand scenes
 SCENES_ENDING = ".scenes.json"  # drawn scenes are kept in a file with this ending
@@ -118,10 +120,13 @@ def facts(plan: Plan, command: str) -> dict[str, Any]:
     config["scene"]["file"] = shown(plan.file)
     if plan.config.perception.weights is not None:
         config["perception"]["weights"] = shown(plan.config.perception.weights)
+    symmetric = {name: value for name, value in symmetries(plan.config.scene.objects, plan.config.names).items()
+                 if value != NONE}
     digest = hashlib.sha256(plan.file.read_bytes()).hexdigest()
     return {"command": command, "commit": commit(), "agent": plan.agent, "objects": plan.config.scene.objects,
             "weights": weight_hashes(plan.agent, plan.config), "machine": machine(),
-            "scenes": {"suite": plan.suite, "file": shown(plan.file), "sha256": digest}, "config": config}
+            "scenes": {"suite": plan.suite, "file": shown(plan.file), "sha256": digest} |
+            ({"symmetry": symmetric} if symmetric else {}), "config": config}
 
 
 def bench(plan: Plan, *, jobs: int, command: str, console: Console, cluster: str | None = None) -> list[dict[str, Any]]:

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 import typer
 
 from saccade.app.cli.options import (
+    AGENT_DEFAULT,
     AGENTS,
     ConfigFile,
     Objects,
@@ -31,7 +32,8 @@ def bench(*, objects: Objects = None, scenes: ScenesFile = None,
           suite: Annotated[str | None, typer.Option(
               help="Scenes: paper-500, yaw-500, lexa-room, looks, dev (for tuning), paper-like or paper-like-yaw.",
               show_default="paper-500 for ycb, paper-like for pantry")] = None,
-          agent: Annotated[str, typer.Option(help=f"Which agent to measure: {AGENTS}.")] = "sceneccn",
+          agent: Annotated[str | None, typer.Option(
+              help=f"Which agent to measure: {AGENTS}.", show_default=AGENT_DEFAULT)] = None,
           limit: Annotated[int | None, typer.Option(min=1, help="Run only so many scenes, chosen evenly.")] = None,
           jobs: Annotated[int, typer.Option(min=1, help="How many processes work at a time.")] = 1,
           cluster: Cluster = None,
@@ -46,8 +48,8 @@ def bench(*, objects: Objects = None, scenes: ScenesFile = None,
     from saccade.app.bench.bench import bench as run_bench
     from saccade.app.bench.bench import prepare
 
-    resolved = configured(config, {"scene.objects": objects, "scene.file": scenes, "seed": seed,
-                                   "perception.weights": weights}, values, agent)
+    resolved, agent = configured(config, {"scene.objects": objects, "scene.file": scenes, "seed": seed,
+                                          "perception.weights": weights}, values, agent)
     if yaw is not None and (resolved.scene.file is not None or suite is not None):
         raise SaccadeError("--yaw is for scenes that are drawn: leave it or --scenes and --suite out")
     if yaw is not None:

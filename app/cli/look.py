@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from saccade.app.cli.options import Names, Objects, WeightsFolder, wide
+from saccade.app.cli.options import AGENT_DEFAULT, Names, Objects, WeightsFolder, wide
 from saccade.shared.errors import SaccadeError
 from saccade.shared.log.folder import PICTURE_NAME
 
@@ -90,7 +90,8 @@ def film(log: Log, out: Annotated[Path, typer.Argument(help="File of the film: O
 @app.command()
 def see(photos: Annotated[list[Path], typer.Argument(metavar="PHOTO...", help="Photographs: PNG or JPEG.")], *,
         objects: Objects = None, names: Names = None,
-        agent: Annotated[str, typer.Option(help="Whose networks look: sceneccn, open, paper or posecnn.")] = "sceneccn",
+        agent: Annotated[str | None, typer.Option(
+            help="Whose networks look: sceneccn, open, paper or posecnn.", show_default=AGENT_DEFAULT)] = None,
         weights: WeightsFolder = None,
         intrinsics: Annotated[str | None, typer.Option(
             help="Intrinsics of the photographs in their own size, in pixels.", metavar="fx,fy,cx,cy",
@@ -108,8 +109,8 @@ def see(photos: Annotated[list[Path], typer.Argument(metavar="PHOTO...", help="P
     given = numbers(intrinsics)
     if given is not None and len(given) != 4:
         raise SaccadeError(f"--intrinsics {intrinsics!r}: write fx,fy,cx,cy, such as 615,615,320,240")
-    config = configured(None, {"scene.objects": objects, "scene.names": split_names(names),
-                               "perception.weights": weights}, None, agent)
+    config, agent = configured(None, {"scene.objects": objects, "scene.names": split_names(names),
+                                      "perception.weights": weights}, None, agent)
     if look_at(photos, config, agent=agent, intrinsics_px=given, json_file=json_file, out=out, console=wide(Console())):
         raise typer.Exit(2)  # each one was said
 

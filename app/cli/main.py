@@ -9,10 +9,11 @@ from typing import Annotated
 
 import typer
 
-from saccade.app.cli import bench, log, look, objects, poses, replay, run, train
+from saccade.app.cli import bench, camera, log, look, objects, poses, replay, run, train
 from saccade.app.cli.front import FrontDoor, command_of
 from saccade.app.run.threads import prefer_one_thread
 from saccade.shared.errors import LINE_LIMIT, SaccadeError, printable
+from saccade.shared.files import remedy
 
 EXIT_ERROR, EXIT_INTERRUPTED = 2, 130
 MENDABLE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO, errno.ENAMETOOLONG,
@@ -39,7 +40,7 @@ def front_door(version: Annotated[bool, typer.Option(
     """An active-vision agent: it looks, believes and moves until it sees the goal image."""
 
 
-for commands in (run, replay, bench, train, look):
+for commands in (run, replay, bench, train, look, camera):
     app.add_typer(commands.app)
 app.add_typer(log.app, name="log")
 app.add_typer(poses.app, name="poses")
@@ -66,7 +67,7 @@ def main() -> None:
         if error.errno not in MENDABLE:
             raise
         where = f"{error.filename}: " if error.filename else ""
-        told = printable(f"{where}{error.strerror}: free some space, or name another place", LINE_LIMIT)
+        told = printable(f"{where}{error.strerror}: {remedy(error)}", LINE_LIMIT)
         print(f"saccade: {told}", file=sys.stderr)
         sys.exit(EXIT_ERROR)
     except SystemExit as error:

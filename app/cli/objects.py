@@ -21,18 +21,27 @@ def add(meshes: Annotated[list[Path], typer.Argument(metavar="MESH...", help="OB
             help="Unit of the file's lengths. Without it, that in which the object is of household size.")] = "auto",
         up: Annotated[Literal["auto", "z", "y"], typer.Option(
             help="Which axis of the file points up.")] = "auto",
+        symmetry: Annotated[str | None, typer.Option(
+            help="How the object looks the same when it is turned about the vertical: none, continuous, or how often, "
+                 "such as 4.", show_default="found by looking at it from around")] = None,
         yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False) -> None:
     """Add objects to a set of your own, from their meshes, and learn them."""
     from rich.console import Console
 
     from saccade.app.objects.adding import add_meshes
     from saccade.shared.errors import SaccadeError
+    from saccade.shared.world.symmetry import symmetry_from
 
+    try:
+        known = None if symmetry is None else symmetry_from(symmetry)
+    except ValueError as error:
+        raise SaccadeError(f"--{error}") from error
     if not yes and not sys.stdin.isatty():
         raise SaccadeError("nobody can be asked without a terminal whether an object is right: add --yes")
     if name is not None and len(meshes) > 1:
         raise SaccadeError("--name is for one mesh: add the others without it, or one by one")
-    add_meshes(meshes, objects, name=name, unit=unit, up=up, ask=None if yes else _ask, console=Console())
+    add_meshes(meshes, objects, name=name, unit=unit, up=up, ask=None if yes else _ask, console=Console(),
+               symmetry=known)
 
 
 @app.command("list")
@@ -46,13 +55,15 @@ def list_objects(*, objects: Set = "my") -> None:
 
 
 @app.command()
-def show(name: Annotated[str, NAME], *, objects: Set = "my") -> None:
-    """Show an object: its size, its picture, and which others of the set look most like it."""
+def show(name: Annotated[str, NAME], *, objects: Set = "my",
+         out: Annotated[Path | None, typer.Option(
+             help="Also write a page about it (NAME.md) with pictures.", metavar="FOLDER")] = None) -> None:
+    """Show an object: its size, its symmetry, its picture, and which others of the set look most like it."""
     from rich.console import Console
 
     from saccade.app.objects.showing import show_object
 
-    show_object(objects, name, Console())
+    show_object(objects, name, Console(), out)
 
 
 @app.command()

@@ -8,7 +8,18 @@ from typing import Annotated, Literal
 
 import typer
 
-from saccade.app.cli.options import AGENTS, ConfigFile, Names, Objects, ScenesFile, Seed, Values, WeightsFolder, Yaw
+from saccade.app.cli.options import (
+    AGENT_DEFAULT,
+    AGENTS,
+    ConfigFile,
+    Names,
+    Objects,
+    ScenesFile,
+    Seed,
+    Values,
+    WeightsFolder,
+    Yaw,
+)
 from saccade.app.cli.texts import configured, numbers, split_names
 from saccade.shared.errors import SaccadeError
 
@@ -34,18 +45,34 @@ def run(*, objects: Objects = None, names: Names = None, scenes: ScenesFile = No
         bus: Annotated[Literal["zenoh", "local"] | None, typer.Option(
             help="Run each service as a process on a Zenoh bus, or all within this "
                  "process.", show_default="zenoh")] = None,
-        agent: Annotated[str, typer.Option(help=f"Which agent to run: {AGENTS}.")] = "sceneccn",
+        agent: Annotated[str | None, typer.Option(
+            help=f"Which agent to run: {AGENTS}.", show_default=AGENT_DEFAULT)] = None,
         weights: WeightsFolder = None,
         world: Annotated[str, typer.Option(
             help="Where images come from: simulator, or camera for a real one.")] = "simulator",
         source: Annotated[str | None, typer.Option(
-            help="Images of a real camera: a folder, a video file, or a webcam (webcam:0).")] = None,
+            help="Images of a real camera: a folder, a video file, a ROS 2 bag, a webcam (webcam:0), or a topic of "
+                 "ROS 2 (ros:/camera/image_raw).")] = None,
         poses: Annotated[Path | None, typer.Option(
             help="File or folder with the camera's poses, such as TUM, transforms.json or COLMAP.")] = None,
         intrinsics: Annotated[str | None, typer.Option(
             help="Intrinsics of the camera's images, in pixels.", metavar="fx,fy,cx,cy")] = None,
+        board: Annotated[Path | None, typer.Option(
+            help="Description of a printed board on the table, which tells the camera's poses (`saccade board`).",
+            metavar="BOARD.json")] = None,
+        calibration: Annotated[str | None, typer.Option(
+            help="Calibration of the camera (`saccade calibrate`): a file, or the name of a camera.",
+            metavar="FILE|NAME")] = None,
         rate: Annotated[float | None, typer.Option(
             help="Images per second, of a folder or a webcam.", show_default="10")] = None,
+        image_topic: Annotated[str | None, typer.Option(
+            help="Topic of the images in a ROS 2 bag.", show_default="the one that has a CameraInfo")] = None,
+        camera_frame: Annotated[str | None, typer.Option(
+            help="Frame of the camera in the tf of ROS 2.", show_default="that of the images")] = None,
+        world_frame: Annotated[str | None, typer.Option(
+            help="Frame of tf that is the agent's world.", show_default="the root of tf")] = None,
+        ros: Annotated[bool, typer.Option(
+            "--ros", help="Publish the chosen viewpoint and the beliefs to ROS 2.")] = False,
         loop: Annotated[bool, typer.Option("--loop", help="Begin again with the first image after the last.")] = False,
         config: ConfigFile = None, values: Values = None,
         view: Annotated[bool, typer.Option("--view", help="Show the run in a browser while it goes on.")] = False,
@@ -65,8 +92,11 @@ def run(*, objects: Objects = None, names: Names = None, scenes: ScenesFile = No
              "scene.goal_image": goal,
              "scene.goal_intrinsics_px": numbers(goal_intrinsics, "--goal-intrinsics"),
              "scene.explore": explore or None, "bus.kind": bus,
-             "perception.weights": weights, "camera.source": source, "camera.poses": poses,
-             "camera.intrinsics_px": numbers(intrinsics), "camera.rate_hz": rate, "camera.loop": loop or None}
+             "perception.weights": weights, "camera.source": source, "camera.poses": poses, "camera.board": board,
+             "camera.calibration": calibration,
+             "camera.intrinsics_px": numbers(intrinsics), "camera.rate_hz": rate, "camera.loop": loop or None,
+             "camera.image_topic": image_topic, "camera.camera_frame": camera_frame,
+             "camera.world_frame": world_frame, "ros.publish": ros or None}
     console = Console()
 
     def show(finished: Finished) -> None:
@@ -81,7 +111,8 @@ def run(*, objects: Objects = None, names: Names = None, scenes: ScenesFile = No
             say(console, f"to be seen at {url_of(finished.config.viewer)} until Ctrl-C")
             stay(finished.is_viewed)
 
-    finished = run_agent(configured(config, given, values, agent), agent=agent, out=out, plain=plain, console=console,
-                         world=world, view=view, after=show)
+    resolved, agent = configured(config, given, values, agent)
+    finished = run_agent(resolved, agent=agent, out=out, plain=plain, console=console, world=world, view=view,
+                         after=show)
     if finished.lacks:  # it was said when it happened
         raise typer.Exit(2)

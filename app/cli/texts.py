@@ -9,21 +9,28 @@ from typing import Any
 from saccade.shared.errors import SaccadeError
 
 
-def configured(path: Path | None, given: dict[str, Any], values: list[str] | None, agent: str) -> Any:
-    """The configuration: the agent's, over it the file's, then the options that were given, then `--set`.
+def configured(path: Path | None, given: dict[str, Any], values: list[str] | None,
+               agent: str | None) -> tuple[Any, str]:
+    """The configuration and the name of its agent: the agent's preset, over it the file's, then the options that were
+    given, then `--set`. Without an agent it is the one that knows the objects; this is said if it is not the usual one.
 
     Raises SaccadeError if the agent is unknown, or if a file, a key or a value is wrong.
     """
-    from saccade.app.run.registry import agent_of
-    from saccade.shared.config import load
+    from saccade.app.run.registry import DEFAULT_AGENT, configuration
 
     options = {key: value for key, value in given.items() if value is not None}
-    config = load(path, agent_of(agent).preset).with_values(options | dict(map(parse_value, values or ())))
-    if not is_list(config.scene.objects):
-        return config
-    from saccade.app.objects.lists import assembled
+    config, name = configuration(path, options | dict(map(parse_value, values or ())), agent)
+    if is_list(config.scene.objects):
+        from saccade.app.objects.lists import assembled
 
-    return config.with_values({"scene.objects": assembled(config.scene.objects, config.perception.architecture)})
+        objects = assembled(config.scene.objects, config.perception.architecture)
+        config = config.with_values({"scene.objects": objects})
+    if agent is None and name != DEFAULT_AGENT:
+        from saccade.shared.render.objects import names_of
+
+        names_of(config.scene.objects)  # a name that is misspelt is told first
+        print(f"the agent is {name}, because it is the one that knows objects of your own: `--agent` names another one")
+    return config, name
 
 
 def is_list(objects: str) -> bool:

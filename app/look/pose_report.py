@@ -64,4 +64,5 @@ def _lens(read: Trajectory) -> str:
         return f"intrinsics: a horizontal field of view of {np.degrees(lens.angle_x_rad or 0.0):.1f} degrees"
     size = f", images of {lens.size_px[0]}x{lens.size_px[1]} pixels" if lens.size_px else ""
     told = ", ".join(f"{x:.2f}" for x in lens.intrinsics_px)
-    return f"intrinsics: {told} px{size}{f'; {note}' if note else ''}"
+    removed = f"; {lens.note()}, is removed" if lens.distorts else ""
+    return f"intrinsics: {told} px{size}{f'; {note}' if note else ''}{removed}"

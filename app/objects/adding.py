@@ -10,14 +10,12 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
+from saccade.app.objects.cards import TURNTABLE, Card, png, refresh, turntable
 from saccade.app.objects.learning import learn, require_size
 from saccade.app.objects.store import (
-    TURNTABLE,
-    Card,
     alone_in,
     keep,
     name_from,
@@ -25,19 +23,21 @@ from saccade.app.objects.store import (
     remove,
     require_free,
     require_there,
-    turntable,
 )
+from saccade.app.objects.symmetry import symmetry_of
 from saccade.app.run.display import say
 from saccade.shared.errors import SaccadeError
 from saccade.shared.render.foreign_mesh import Imported, read_mesh
 from saccade.shared.render.objects import names_of
+from saccade.shared.world.symmetry import symmetry_words
 
 Ask = Callable[[str], bool]
 
 
 def add_meshes(paths: Sequence[Path], objects: str, *, name: str | None, unit: Literal["auto", "m", "cm", "mm"],
-               up: Literal["auto", "z", "y"], ask: Ask | None, console: Console) -> None:
-    """Adds objects to a set of the user's and learns them. `ask` is asked whether an object is right.
+               up: Literal["auto", "z", "y"], ask: Ask | None, console: Console, symmetry: int | None = None) -> None:
+    """Adds objects to a set of the user's and learns them. `ask` is asked whether an object is right. Without a
+    `symmetry` that of each object is found by looking at it from around.
 
     A mesh that cannot be read is one line on stderr, and nothing of it is kept. Raises SaccadeError if the set cannot
     be used, if a name is used twice, or if a mesh was refused.
@@ -54,20 +54,25 @@ def add_meshes(paths: Sequence[Path], objects: str, *, name: str | None, unit: L
                 failed += 1
                 print(f"saccade: {error}", file=sys.stderr)
                 continue
-            added += _add(folder, path, imported, ask, console)
+            added += _add(folder, path, imported, ask, console, symmetry)
         if added:
             _learn(objects, folder, console)
     if failed:
         raise SaccadeError(f"{failed} of {len(paths)} meshes could not be added: see above")
 
 
-def _add(folder: Path, path: Path, imported: Imported, ask: Ask | None, console: Console) -> bool:
+def _add(folder: Path, path: Path, imported: Imported, ask: Ask | None, console: Console,
+         symmetry: int | None) -> bool:
     """Keeps a mesh, if it is right. Returns whether it is."""
     mesh, picture = imported.mesh, turntable(imported.mesh)
+    found = symmetry_of(mesh) if symmetry is None else None
+    known = symmetry if found is None else found
+    assert known is not None  # it is one of the two
     for note in imported.notes:
         say(console, f"{mesh.name}: {note}")
     size = " x ".join(f"{100 * side:.1f}" for side in mesh.size_m)
-    card = Card(str(path), imported.unit, imported.up, imported.notes)
+    card = Card(str(path), imported.unit, imported.up, imported.notes, symmetry=known, symmetry_found=found)
+    say(console, f"{mesh.name}: turned about the vertical, it {symmetry_words(known)}")
     if ask is None:
         say(console, f"{mesh.name}: {size} cm; its picture is {keep(folder, mesh, card, picture) / TURNTABLE}")
         return True
@@ -77,18 +82,18 @@ def _add(folder: Path, path: Path, imported: Imported, ask: Ask | None, console:
     if right:
         keep(folder, mesh, card, picture)
     else:
-        say(console, f"{mesh.name} is not added: --unit and --up say how the file is meant")
+        say(console, f"{mesh.name} is not added: --unit, --up and --symmetry say how the file is meant")
     return right
 
 
 def _saved(picture: NDArray[np.uint8], folder: Path) -> Path:
-    Image.fromarray(picture).save(folder / TURNTABLE)
+    (folder / TURNTABLE).write_bytes(png(picture))
     return folder / TURNTABLE
 
 
 def learn_set(objects: str, console: Console) -> None:
-    """Learns what is new or changed in a set. Raises SaccadeError if it is not there, or if something cannot be
-    learnt."""
+    """Learns what is new or changed in a set, and brings the cards and the pictures up to date. Raises SaccadeError if
+    it is not there, or if something cannot be learnt."""
     folder = own_folder(objects)
     names_of(objects)  # that there are some
     with alone_in(folder):
@@ -101,14 +106,29 @@ def _learn(objects: str, folder: Path, console: Console) -> None:
         bar = progress.add_task("learning", total=None)
         done = learn(objects, folder, lambda name, done, total: progress.update(
             bar, description=name, completed=done, total=total))
-    for line in done.refused:
+    for line in done.refused.values():
         print(f"saccade: {line}", file=sys.stderr)
     known = len(names_of(objects)) - len(done.refused)
+    wrong = _refreshed(folder, [name for name in names_of(objects) if name not in done.refused], console)
     say(console, f"learnt {', '.join(done.names) or 'nothing new'}: {known} object{'s' * (known != 1)} in {folder}")
     if known:
-        say(console, f"use {'it' if known == 1 else 'them'} with `--agent open --objects {objects}`")
+        say(console, f"use {'it' if known == 1 else 'them'} with `--objects {objects}`")
     if done.refused:
         raise SaccadeError(f"{len(done.refused)} of the set's objects could not be learnt: see above")
+    if wrong:
+        raise SaccadeError(f"{wrong} of the set's cards could not be brought up to date: see above")
+
+
+def _refreshed(folder: Path, names: Sequence[str], console: Console) -> int:
+    """Brings cards and pictures up to date. Returns how many could not be."""
+    wrong = 0
+    for name in names:
+        try:
+            refresh(folder / name, lambda text: say(console, text))
+        except SaccadeError as error:
+            wrong += 1
+            print(f"saccade: {error}", file=sys.stderr)
+    return wrong
 
 
 def remove_objects(objects: str, names: Sequence[str], console: Console) -> None:

@@ -1,8 +1,7 @@
-"""Learns the objects of a set: makes the bank of each, and leaves those of the others as they are, to the byte."""
+"""Learns the objects of a set: makes the bank of each, and does not touch the files of the others."""
 
 from __future__ import annotations
 
-import hashlib
 import shutil
 from collections.abc import Callable
 from contextlib import suppress
@@ -13,12 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from saccade.app.objects.cards import digest
+from saccade.services.perception.local_features import SHA256
 from saccade.shared.config import WEIGHTS, learned_folder
 from saccade.shared.errors import SaccadeError
-from saccade.shared.files import read_bytes
+from saccade.shared.files import writing
 from saccade.shared.log.provenance import commit
-from saccade.shared.model.weights import OPEN, ObjectCard, Weights, write_weights
-from saccade.shared.render.mesh import MAX_FILE_BYTES, MESH_FILE
+from saccade.shared.model.weights import OPEN, ObjectCard, Weights, bank_file, write_weights
 from saccade.shared.render.objects import load_mesh, own_names
 from saccade.shared.render.views import crop_side_m
 from saccade.training.open.banks import BankMaker
@@ -29,10 +29,10 @@ SIZES_M = (0.002, 5.0)  # the largest side of an object
 
 @dataclass(frozen=True)
 class Learnt:
-    """The names of the objects that were learnt, and a line for each one that could not be."""
+    """The names of the objects that were learnt, and for each one that could not be a line that says why."""
 
     names: list[str]
-    refused: list[str]
+    refused: dict[str, str]
 
 
 def learn(objects: str, folder: Path, show: Callable[[str, int, int], None]) -> Learnt:
@@ -42,15 +42,16 @@ def learn(objects: str, folder: Path, show: Callable[[str, int, int], None]) -> 
     Raises SaccadeError if the networks are damaged, or if the banks cannot be written.
     """
     networks, target = Weights(WEIGHTS / OPEN), learned_folder(objects, OPEN)
-    names, refused = own_names(folder), list[str]()
+    basis = f"{networks.basis}+{SHA256}"  # banks are made by the networks, and by local features
+    names, refused = own_names(folder), dict[str, str]()
     digests: dict[str, str] = {}
     for name in names:
         try:
             digests[name] = digest(folder / name)
         except SaccadeError as error:
-            refused.append(str(error))
-    cards, banks, is_whole = _known(target, networks.basis, digests)
-    missing = [name for name in digests if name not in banks]
+            refused[name] = str(error)
+    cards, hashes, is_whole = _known(target, basis, digests)
+    missing = [name for name in digests if name not in cards]
     make = BankMaker(networks)
     learnt = list[str]()
     for done, name in enumerate(missing):
@@ -59,15 +60,15 @@ def learn(objects: str, folder: Path, show: Callable[[str, int, int], None]) -> 
             mesh = load_mesh(objects, name)
             require_size(mesh.size_m, name)
         except SaccadeError as error:
-            refused.append(f"{error}; or remove it with `saccade objects remove {name}`")
+            refused[name] = f"{error}; or remove it with `saccade objects remove {name}`"
             continue
-        banks[name] = make(mesh).arrays()
+        bank = make(mesh).arrays()
         cards[name] = ObjectCard(name, mesh.size_m, crop_side_m(mesh.size_m))
-        _write(target, networks.basis, digests, cards, banks)
+        hashes = _write(target, basis, digests, cards, {name: bank}, hashes)
         learnt.append(name)
         show(name, done + 1, len(missing))
     if not learnt and not is_whole and cards:
-        _write(target, networks.basis, digests, cards, banks)
+        _write(target, basis, digests, cards, {}, hashes)
     _forget(target, cards)
     return Learnt(learnt, refused)
 
@@ -81,28 +82,31 @@ def require_size(size_m: NDArray[np.float64], name: str) -> None:
 
 
 def _write(target: Path, basis: str, digests: dict[str, str], cards: dict[str, ObjectCard],
-           banks: dict[str, Arrays]) -> None:
+           banks: dict[str, Arrays], hashes: dict[str, str]) -> dict[str, str]:
+    """Writes new banks, beside those that are there with these hashes. Returns the hashes of all."""
     facts = {"architecture": OPEN, "networks": OPEN, "networks_sha256": basis, "commit": commit(),
              "meshes_sha256": {name: digests[name] for name in cards}}
-    write_weights(target, {}, tuple(cards.values()), facts, banks)
+    return write_weights(target, {}, tuple(cards.values()), facts, banks, hashes)
 
 
 def _known(target: Path, basis: str,
-           digests: dict[str, str]) -> tuple[dict[str, ObjectCard], dict[str, Arrays], bool]:
-    """The cards and banks that are still right, and whether these are all that there are."""
+           digests: dict[str, str]) -> tuple[dict[str, ObjectCard], dict[str, str], bool]:
+    """The cards of the banks that are still right, the hashes of these banks' files, and whether these are all that
+    there are."""
     cards: dict[str, ObjectCard] = {}
-    banks: dict[str, Arrays] = {}
+    hashes: dict[str, str] = {}
     try:
         weights = Weights(target)
     except SaccadeError:  # there are none, or they are damaged: they are made again
-        return cards, banks, False
+        return cards, hashes, False
     before = digests_of(weights) if weights.manifest.get("networks_sha256") == basis else {}
     for card in weights.cards:
         if before.get(card.name) == digests.get(card.name, ""):
             with suppress(SaccadeError):
-                banks[card.name] = weights.bank(card.name)
+                weights.bank(card.name)
+                hashes[bank_file(card.name)] = weights.hashes[bank_file(card.name)]
                 cards[card.name] = card
-    return cards, banks, len(cards) == len(weights.cards)
+    return cards, hashes, len(cards) == len(weights.cards)
 
 
 def digests_of(weights: Weights) -> dict[str, str]:
@@ -113,27 +117,10 @@ def digests_of(weights: Weights) -> dict[str, str]:
 
 def _forget(target: Path, cards: dict[str, ObjectCard]) -> None:
     """Removes the files of banks whose objects are gone, and all if none is left."""
-    if not cards:
-        shutil.rmtree(target, ignore_errors=True)
-    for path in target.glob("*.bank.safetensors"):
-        if path.name.removesuffix(".bank.safetensors") not in cards:
-            path.unlink()
-
-
-def digest(folder: Path) -> str:
-    """The hash of an object's mesh and texture. Raises SaccadeError if they cannot be read."""
-    found, need = hashlib.sha256(), "mend it, or remove the object and add it again"
-    paths = [folder / MESH_FILE, *(path for ending in ("png", "jpg", "jpeg")
-                                   if (path := folder / f"texture_map.{ending}").is_file())]
-    for path in paths:
-        found.update(read_bytes(path, "mesh", need, MAX_FILE_BYTES))
-    return found.hexdigest()
-
-
-def likeness(objects: str) -> tuple[tuple[str, ...], NDArray[np.float64]]:
-    """How alike the objects of a set look: for each pair the largest similarity of two views [K, K], 1 being the same.
-    Raises SaccadeError if the set was not learnt."""
-    weights = Weights(learned_folder(objects, OPEN))
-    vectors = [weights.bank(name)["vectors"].astype(np.float64) for name in weights.names]
-    return weights.names, np.array([[float((a @ b.T).max()) for b in vectors] for a in vectors])
-
+    kept = set(map(bank_file, cards))
+    with writing(target, "weights"):
+        if not cards and target.is_dir():
+            shutil.rmtree(target)
+        for path in target.glob(bank_file("*")):
+            if path.name not in kept:
+                path.unlink()

@@ -6,8 +6,9 @@ import hashlib
 import os
 from pathlib import Path
 
+from saccade.app.objects.cards import Card
 from saccade.app.objects.learning import learn
-from saccade.app.objects.store import Card, alone_in, keep
+from saccade.app.objects.store import alone_in, keep
 from saccade.shared.config import BUILT_IN_SETS, set_folder, sets_folder
 from saccade.shared.errors import SaccadeError, told
 from saccade.shared.files import writing
@@ -42,7 +43,7 @@ def assembled(objects: str, architecture: str) -> str:
     if architecture == OPEN:
         with alone_in(folder):
             if refused := learn(str(folder), folder, lambda *_: None).refused:
-                raise SaccadeError(refused[0])
+                raise SaccadeError(next(iter(refused.values())))
     return str(folder)
 
 

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from saccade.app.objects.learning import digest, digests_of, likeness
-from saccade.app.objects.store import CARD, TURNTABLE
+from saccade.app.objects.cards import TURNTABLE, digest
+from saccade.app.objects.learning import digests_of
+from saccade.app.objects.page import pairs_of, write_page
 from saccade.app.run.display import say
 from saccade.shared.config import learned_folder, set_folder
 from saccade.shared.errors import LINE_LIMIT, SaccadeError, printable, told
+from saccade.shared.model.bank import bank_in
+from saccade.shared.model.object_card import CARD
 from saccade.shared.model.weights import OPEN, Weights
 from saccade.shared.render.objects import load_mesh, names_of
 
@@ -29,9 +34,9 @@ def list_set(objects: str, console: Console) -> None:
     console.print(table)
 
 
-def show_object(objects: str, name: str, console: Console) -> None:
-    """Prints what is known of an object, and which others look most like it. Raises SaccadeError if it is not
-    there."""
+def show_object(objects: str, name: str, console: Console, out: Path | None = None) -> None:
+    """Prints what is known of an object, and which others look most like it; writes a page about it into the folder
+    `out`. Raises SaccadeError if it is not there."""
     if name not in names_of(objects):
         raise SaccadeError(f"object {told(name)} is not in {objects!r}: it holds {', '.join(names_of(objects))}")
     folder = set_folder(objects)
@@ -42,14 +47,16 @@ def show_object(objects: str, name: str, console: Console) -> None:
         say(console, f"its picture is {folder / name / TURNTABLE}")
     else:
         say(console, f"{name}: {_size(load_mesh(objects, name).size_m)} cm")
-    if (state := _learnt(objects, name)) != "yes":
+    state = _learnt(objects, name)
+    if out is not None:
+        say(console, f"written to {write_page(objects, name, out, is_learnt=state == 'yes')}")
+    if state != "yes":
         say(console, f"learnt: {state}; `saccade objects learn` does it")
         return
-    names, alike = likeness(objects)
-    row = alike[names.index(name)]
-    others = sorted(((float(row[k]), other) for k, other in enumerate(names) if other != name), reverse=True)[:ALIKE]
-    if others:
-        said = ", ".join(f"{other} ({value:.2f})" for value, other in others)
+    weights = Weights(learned_folder(objects, OPEN))
+    pairs = pairs_of(name, {each: bank_in(weights, each) for each in weights.names})[:ALIKE]
+    if pairs:
+        said = ", ".join(f"{pair.other} ({pair.similar:.2f})" for pair in pairs)
         say(console, f"most like it (1 is the same): {said}")
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import os
 import re
 import shutil
@@ -11,46 +10,26 @@ import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from saccade.app.objects.cards import TURNTABLE, Card, digest, png, turntable
 from saccade.shared.config import set_folder
 from saccade.shared.errors import SaccadeError, told
 from saccade.shared.files import writing
+from saccade.shared.model.object_card import CARD
 from saccade.shared.render.mesh import MESH_FILE, Mesh
 from saccade.shared.render.objects import own_names
-from saccade.shared.render.world import World
 from saccade.shared.wording import WORLD
-from saccade.shared.world.geometry import direction, look_at
 
 if sys.platform != "win32":
     import fcntl
 
-CARD, TEXTURE, TURNTABLE = "object.toml", "texture_map.png", "turntable.png"
+TEXTURE = "texture_map.png"
 RESERVED = "weights"  # what is learnt of a set lies in folders whose names begin so
-VIEWS, VIEW_PX = 8, 160  # of the picture of an object
-ELEVATION_RAD, HALF_ANGLE = 0.5, 0.35  # of its camera; the tangent of half the angle that the object covers
-
-
-@dataclass(frozen=True)
-class Card:
-    """What is known of an object beside its mesh: where it came from, and what was done with it."""
-
-    source: str
-    unit: str
-    up: str
-    notes: tuple[str, ...] = ()
-    licence: str = ""
-
-    def text(self, mesh: Mesh) -> str:
-        """The file's text, TOML."""
-        values = {"name": mesh.name, "size_m": [round(float(side), 4) for side in mesh.size_m], "source": self.source,
-                  "unit": self.unit, "up": self.up, "licence": self.licence, "notes": list(self.notes)}
-        return "".join(f"{key} = {json.dumps(value, ensure_ascii=False)}\n" for key, value in values.items())
 
 
 def own_folder(objects: str) -> Path:
@@ -106,7 +85,7 @@ def alone_in(folder: Path) -> Iterator[None]:
 
 
 def keep(folder: Path, mesh: Mesh, card: Card, picture: NDArray[np.uint8] | None = None) -> Path:
-    """Puts an object into a set, at once or not at all; `picture` is that of `turntable`. Returns its folder. Raises
+    """Puts an object into a set, at once or not at all; `picture` is its turntable. Returns its folder. Raises
     SaccadeError if this fails."""
     target = folder / mesh.name
     with writing(target, "object"):
@@ -115,8 +94,8 @@ def keep(folder: Path, mesh: Mesh, card: Card, picture: NDArray[np.uint8] | None
         try:
             (staging / MESH_FILE).write_text(obj_text(mesh))
             Image.fromarray(mesh.texture).save(staging / TEXTURE)
-            Image.fromarray(turntable(mesh) if picture is None else picture).save(staging / TURNTABLE)
-            (staging / CARD).write_text(card.text(mesh), encoding="utf-8")
+            (staging / TURNTABLE).write_bytes(png(turntable(mesh) if picture is None else picture))
+            (staging / CARD).write_text(card.text(mesh, digest(staging)), encoding="utf-8")
             staging.chmod(0o755)
             os.rename(staging, target)
         finally:
@@ -148,17 +127,3 @@ def obj_text(mesh: Mesh) -> str:
     np.savetxt(text, mesh.texcoords, "vt %.6f %.6f")
     np.savetxt(text, np.repeat(mesh.faces + 1, 2, axis=1), "f %d/%d %d/%d %d/%d")
     return text.getvalue()
-
-
-def turntable(mesh: Mesh) -> NDArray[np.uint8]:
-    """Views of an object from all around, side by side [160, 1280, 3]. Raises SaccadeError if OpenGL does not work."""
-    focal = VIEW_PX / 2 / HALF_ANGLE
-    world = World((mesh,), size_px=VIEW_PX, intrinsics_px=np.array([focal, focal, VIEW_PX / 2, VIEW_PX / 2]))
-    world.show_table(False)
-    world.place({mesh.name: (np.zeros(3), 0.0)})
-    away = float(np.linalg.norm(mesh.size_m)) / 2 / HALF_ANGLE * 1.1
-    cameras = [look_at(away * direction(azimuth, ELEVATION_RAD), np.zeros(3))
-               for azimuth in 2 * np.pi / VIEWS * np.arange(VIEWS)]
-    picture = np.concatenate([world.render(camera) for camera in cameras], axis=1)
-    world.close()
-    return picture

@@ -3,15 +3,18 @@ are derived from this list."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
+from pathlib import Path
+from typing import Any
 
 from saccade.app.run.launch import JUDGE, RECORDER
-from saccade.app.run.supervisor import VIEWER, Process
+from saccade.app.run.supervisor import ROS, VIEWER, Process
 from saccade.app.run.threads import limit_torch
 from saccade.shared.bus.topics import TRUTH
-from saccade.shared.config import Config
+from saccade.shared.config import BUILT_IN_SETS, Config
+from saccade.shared.config import load as load_config
 from saccade.shared.errors import SaccadeError
 from saccade.shared.loop.modules import chosen_module, load
 from saccade.shared.loop.service import Core, Service
@@ -51,7 +54,7 @@ class Agent:
     knows: str = "RGB, camera pose"
 
 
-DEFAULT_AGENT = "sceneccn"
+DEFAULT_AGENT, AGENT_OF_OWN_SETS = "sceneccn", "open"
 ALL_THREE = ("perception", "belief", "planner")
 AGENTS = {
     "sceneccn": Agent(ALL_THREE),
@@ -72,6 +75,19 @@ def agent_of(name: str) -> Agent:
     if name not in AGENTS:
         raise SaccadeError(f"agent {name!r} is unknown: choose from {', '.join(AGENTS)}")
     return AGENTS[name]
+
+
+def configuration(path: Path | None, keys: Mapping[str, Any], agent: str | None = None) -> tuple[Config, str]:
+    """The configuration and the name of its agent: the agent's preset, over it the file, over it the dotted keys.
+
+    Without the name of an agent it is the one that knows the configured objects: `open` for a set of the user's,
+    unless weights are given. Raises SaccadeError if the agent is unknown, or if the file, a key or a value is wrong.
+    """
+    if agent is None:
+        given = load_config(path).with_values(dict(keys))
+        is_own = given.scene.objects not in BUILT_IN_SETS and given.perception.weights is None
+        agent = AGENT_OF_OWN_SETS if is_own else DEFAULT_AGENT
+    return load_config(path, agent_of(agent).preset).with_values(dict(keys)), agent
 
 
 def world_of(name: str) -> World:
@@ -105,14 +121,17 @@ def local_pairs(agent: str, config: Config, world: str = DEFAULT_WORLD) -> list[
     return [source, *agents, *judges]
 
 
-def agent_processes(agent: str, world: str = DEFAULT_WORLD, *, view: bool = False) -> tuple[Process, ...]:
-    """Returns the processes of a run on the bus: the router first, the source second, and with `view` the viewer last.
-    Raises SaccadeError if the agent runs only within one process."""
+def agent_processes(agent: str, world: str = DEFAULT_WORLD, *, view: bool = False,
+                    ros: bool = False) -> tuple[Process, ...]:
+    """Returns the processes of a run on the bus: the router first, the source second, and the onlookers last: with
+    `view` the viewer, and with `ros` the bridge to ROS 2. Raises SaccadeError if the agent runs only within one
+    process."""
     chosen, place = agent_of(agent), world_of(world)
     if chosen.cores:
         raise SaccadeError(f"agent {agent!r} runs within one process only: add `--bus local`, or bus='local' in Python")
     names = (ROUTER, place.source, *chosen.services, *place.judges, RECORDER)
-    return (*(Process(name, f"saccade.services.{name}") for name in names), *((VIEWER,) if view else ()))
+    onlookers = (*((VIEWER,) if view else ()), *((ROS,) if ros else ()))
+    return (*(Process(name, f"saccade.services.{name}") for name in names), *onlookers)
 
 
 def weight_hashes(agent: str, config: Config) -> dict[str, str]:

@@ -17,10 +17,12 @@ from rich.console import Console
 from saccade.app.run.display import Display, say
 from saccade.app.run.launch import launched
 from saccade.app.run.registry import DEFAULT_WORLD, agent_of, agent_processes, local_pairs, require_services, world_of
-from saccade.app.run.summary import summary
+from saccade.app.run.summary import summary, unusable_line
 from saccade.app.run.supervisor import VIEWER
+from saccade.services.camera.calibration import calibration_path
 from saccade.services.camera.core import build as build_camera
-from saccade.services.camera.sources import absolute, webcam_number
+from saccade.services.camera.core import require_one_of_each
+from saccade.services.camera.sources import absolute, is_live
 from saccade.services.recorder.core import describe, to_be_finished
 from saccade.services.viewer.server import binary, url_of, with_free_ports
 from saccade.shared.bus.messages import Message, Result
@@ -63,7 +65,9 @@ def run(config: Config, *, agent: str, out: Path | None, plain: bool, console: C
     require_weights(agent, config)
     if view:
         config = to_be_viewed(config)
-    processes = agent_processes(agent, world, view=view) if config.bus.kind == "zenoh" else ()
+    if config.ros.publish and config.bus.kind != "zenoh":
+        raise SaccadeError("ros.publish is for services on the bus: leave `--bus local` out")
+    processes = agent_processes(agent, world, view=view, ros=config.ros.publish) if config.bus.kind == "zenoh" else ()
     folder = _new_folder(out or Path("runs") / f"{time.strftime('%Y%m%d-%H%M%S')}-{config.seed}")
     lacks: list[str] = []
     ended = None  # stays None if the run is interrupted: then no viewer stays
@@ -116,8 +120,10 @@ def in_world(config: Config, world: str) -> Config:
     config = config.with_values({"scene.explore": scene.explore or scene.goal_image is None,
                                  "bus.live": config.bus.kind == "zenoh"})
     from_outside = config.services.source is not None
-    if not from_outside and (camera.source is None or webcam_number(camera.source) is None):
-        build_camera(config)  # not for a webcam, because this would switch it on and off
+    if not from_outside:
+        require_one_of_each(camera)
+    if not from_outside and (camera.source is None or not is_live(camera.source)):
+        build_camera(config)  # not for what is live: this would switch a webcam on and off
     return config
 
 
@@ -125,8 +131,11 @@ def resolve(config: Config) -> Config:
     """Returns the configuration with the names of its objects and with absolute paths."""
     scene = config.scene
     paths = {"scene.file": scene.file, "scene.goal_image": scene.goal_image,
-             "camera.poses": config.camera.poses, "perception.weights": config.perception.weights}
+             "camera.poses": config.camera.poses, "camera.board": config.camera.board,
+             "perception.weights": config.perception.weights}
     source = {} if config.camera.source is None else {"camera.source": absolute(config.camera.source)}
+    if config.camera.calibration is not None:
+        paths["camera.calibration"] = calibration_path(config.camera.calibration)
     return config.with_values({"scene.names": list(names_in_use(scene))} | source |
                               {key: path.resolve() for key, path in paths.items() if path is not None})
 
@@ -172,6 +181,8 @@ def run_here(config: Config, agent: str, folder: Path, display: Display, world: 
                 log.close()
             if left_out := getattr(source, "skipped", 0):
                 display.note(f"{left_out} images without a pose were left out")
+            if unusable := getattr(source, "refused", 0):
+                display.note(unusable_line(unusable))
     return display.progress.results
 
 

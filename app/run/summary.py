@@ -50,6 +50,11 @@ def _result_line(config: Config, result: Result) -> str:
             f"elevation {result.elevation_error_rad:.3f} rad, range {result.range_error_m:.3f} m")
 
 
+def unusable_line(count: int) -> str:
+    """Says how many messages of the camera's source could not be used."""
+    return f"{count} message{' that cannot be used was' if count == 1 else 's that cannot be used were'} left out"
+
+
 def _camera_lines(config: Config, progress: Progress) -> list[str]:
     """What was seen, and what the agent says about the goal. A real camera has no truth with which this could be
     judged."""
@@ -59,6 +64,8 @@ def _camera_lines(config: Config, progress: Progress) -> list[str]:
     told = [f"{views} view{'' if views == 1 else 's'}"]
     if without_pose:
         told.append(f"{without_pose} images without a pose were left out")
+    if "camera" in progress.statuses and (unusable := progress.statuses["camera"].refused):
+        told.append(unusable_line(unusable))
     lines = ["; ".join(told + [f"{name} skipped {count}" for name, count in skipped.items()])]
     goal_image = config.scene.goal_image
     if config.scene.explore or goal_image is None:

@@ -40,6 +40,7 @@ class Process:
 
 
 VIEWER = Process("viewer", "saccade.services.viewer", onlooker=True)
+ROS = Process("ros", "saccade.services.ros", onlooker=True)
 
 
 class Supervisor:

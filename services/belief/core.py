@@ -17,6 +17,7 @@ from saccade.shared.config import Config
 from saccade.shared.loop.seeding import generator
 from saccade.shared.loop.service import Inputs, Service
 from saccade.shared.model.latent import LatentTransition
+from saccade.shared.model.object_card import symmetries
 from saccade.shared.model.weights import WITH_LATENTS, Weights
 
 SERVICE = Service("belief", inputs=(PERCEPT, GOAL_PERCEPT), trigger=PERCEPT, outputs=(BELIEF,))
@@ -40,13 +41,14 @@ class Energy(TypedDict, total=False):
 class BeliefFilter:
     """Turns percepts into beliefs. Its state, the particles and the kept views, follows from the episode's percepts.
 
-    Raises SaccadeError if the weights are missing or damaged, or if they lack an object.
+    Raises SaccadeError if the weights are missing or damaged, if they lack an object, or if a card is damaged.
     """
 
     def __init__(self, config: Config, names: tuple[str, ...]):
         self.config, self.names = config, names
         weights = Weights(config.weights)
         self.radius_m = {card.name: card.radius_m for card in weights.cards_of(names)}
+        self.symmetry = symmetries(config.scene.objects, names)
         # Networks that estimate poses have no latent poses, and so no transition.
         latent = weights.architecture in WITH_LATENTS
         self.transitions = {name: LatentTransition(weights, name) for name in names} if latent else {}
@@ -70,7 +72,7 @@ class BeliefFilter:
         if not self.goal_known:
             self.goal_known = True
             self.goal_views = {
-                name: GoalView(self.config.belief, likeness, goal)
+                name: GoalView(self.config.belief, likeness, goal, self.symmetry[name])
                 for name, goal in inputs["goal_percept"].items() if goal.presence > WORTH_COMPARING
                 for likeness in self._likeness(goal)}
         present = {name for name in self.names if percepts[name].presence > self.config.belief.present_above}
@@ -80,7 +82,7 @@ class BeliefFilter:
     def _likeness(self, goal: Percept) -> list[Likeness]:
         """How views of an object are compared with its percept in the goal image. Empty if they cannot be."""
         if goal.rotations is not None:
-            return [TurnLikeness(goal)]
+            return [TurnLikeness(goal, self.symmetry[goal.object])]
         return [LatentLikeness(self.transitions[goal.object], goal)] if len(goal.latent_mean) else []
 
     def _update(self, name: str, percepts: dict[str, Percept], present: set[str]) -> Belief:

@@ -29,6 +29,7 @@ from saccade.shared.world.geometry import (
     viewing_grid,
     wrap,
 )
+from saccade.shared.world.symmetry import NONE, turns_of
 
 Array = NDArray[np.float64]
 
@@ -81,14 +82,14 @@ class LatentLikeness:
 
 
 class TurnLikeness:
-    """The likeness by rotations, over the turn of the object about the vertical."""
+    """The likeness by rotations, over the turn of the object, which may be symmetric, about the vertical."""
 
-    def __init__(self, goal: Percept):
-        self.directions = GoalDirections(goal)
+    def __init__(self, goal: Percept, symmetry: int = NONE):
+        self.directions, self.symmetry = GoalDirections(goal), symmetry
 
     def of(self, percept: Percept, center: Array) -> Array:
         """Log probability of each turn [T]. It does not depend on where the object is."""
-        return np.log(turn_probability(percept))
+        return np.log(turn_probability(percept, self.symmetry))
 
     def grid(self, log_probability: Array) -> Array:
         """Log probabilities of the directions of the grid [E, A]."""
@@ -113,11 +114,12 @@ class Keyframe:
 class GoalView:
     """The posterior over the directions from which one object looks as in the goal image.
 
-    `goal` is the percept of this object in the goal image.
+    `goal` is the percept of this object in the goal image. If the object is symmetric, all directions from which it
+    looks the same count as the same direction.
     """
 
-    def __init__(self, config: BeliefConfig, likeness: Likeness, goal: Percept):
-        self.config, self.likeness = config, likeness
+    def __init__(self, config: BeliefConfig, likeness: Likeness, goal: Percept, symmetry: int = NONE):
+        self.config, self.likeness, self.equal_rad = config, likeness, turns_of(symmetry, GRID_AZIMUTHS)
         self.measured_range_m = REFERENCE_RANGE_M / goal.scale
         elevation, azimuth = viewing_grid()
         self.elevation, self.azimuth = (x.ravel() for x in np.meshgrid(elevation, azimuth, indexing="ij"))
@@ -152,12 +154,20 @@ class GoalView:
         last = self.keyframes[-1]
         alone = last.log_likelihood if last.percept is percept else self.likeness.of(percept, self.center)
         share = np.exp(self.likeness.grid(alone)).ravel()
-        near = direction(self.azimuth, self.elevation) @ unit(eye - self.center) > np.cos(HERE_RAD)
-        # Near the pole a change of azimuth rotates the image. Only directions with about the present rotation count.
+        alike = np.any([self._near(eye, equal) for equal in self.equal_rad], axis=0)
+        return float(share[alike].sum())
+
+    def _near(self, eye: Array, equal_rad: float) -> NDArray[np.bool_]:
+        """Which directions of the grid count as that of `eye` [3], turned by an angle after which the object looks the
+        same."""
         azimuth, elevation, _ = spherical(eye, self.center)
-        turned = np.abs(wrap(self.azimuth - azimuth)) < HERE_RAD / max(float(np.cos(elevation)), HERE_RAD)
-        upright = (elevation < np.pi / 2 - 3 * HERE_RAD) | (np.abs(wrap(self.azimuth - azimuth)) < TURNED_RAD)
-        return float(share[near & turned & upright].sum())
+        towards = unit(eye - self.center) if equal_rad == 0.0 else direction(azimuth + equal_rad, elevation)
+        near = direction(self.azimuth, self.elevation) @ towards > np.cos(HERE_RAD)
+        # Near the pole a change of azimuth rotates the image. Only directions with about the present rotation count.
+        aside = np.abs(wrap(self.azimuth - azimuth - equal_rad))
+        turned = aside < HERE_RAD / max(float(np.cos(elevation)), HERE_RAD)
+        upright = (elevation < np.pi / 2 - 3 * HERE_RAD) | (aside < TURNED_RAD)
+        return near & turned & upright
 
     def log_posterior(self) -> Array | None:
         """Log probabilities of the directions of the grid, normalised [E, A]. None before the first view.
@@ -180,8 +190,8 @@ class GoalView:
     def _nearness(self, log_posterior: Array) -> Array:
         """How near each kept view is to the likeliest direction, from 0 to 1 for the same direction [views]."""
         best = int(np.argmax(log_posterior))
-        towards = direction(self.azimuth[best], self.elevation[best])
-        cosines = np.array([unit(k.eye - self.center) @ towards for k in self.keyframes])
+        towards = [direction(self.azimuth[best] + equal, self.elevation[best]) for equal in self.equal_rad]
+        cosines = np.array([max(unit(k.eye - self.center) @ each for each in towards) for k in self.keyframes])
         return np.exp(-0.5 * (np.arccos(np.clip(cosines, -1.0, 1.0)) / NEAR_RAD) ** 2)
 
     def range_m(self, log_posterior: Array) -> float:

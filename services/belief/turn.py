@@ -3,7 +3,8 @@ the goal image.
 
 Each view gives a mixture over the turn. The turn is the same in all views of an object that stands still, so they are
 multiplied. The goal's percept gives a mixture over directions in the object's own frame; turned with the object, they
-become directions in the world. A symmetric object has many turns, and a view that cannot decide has two.
+become directions in the world. A view that cannot decide has two turns. An object whose card says that it is symmetric
+has each turn as often as it looks the same, with the same probability.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 from saccade.shared.bus.messages import Percept
 from saccade.shared.world.geometry import viewing_grid, wrap
+from saccade.shared.world.symmetry import NONE, turns_of
 
 Array = NDArray[np.float64]
 
@@ -27,8 +29,9 @@ def turns() -> Array:
     return (np.arange(TURNS) + 0.5) * 2 * np.pi / TURNS - np.pi
 
 
-def turn_probability(percept: Percept) -> Array:
-    """Probability of each turn about the vertical by one view alone [T]. It has a lower limit (OUTLIER)."""
+def turn_probability(percept: Percept, symmetry: int = NONE) -> Array:
+    """Probability of each turn about the vertical by one view alone [T]. It has a lower limit (OUTLIER). Turns after
+    which an object with this symmetry looks the same have the same probability."""
     assert percept.rotations is not None  # only such percepts come here
     assert percept.log_probability is not None
     assert percept.deviation_rad is not None
@@ -36,7 +39,8 @@ def turn_probability(percept: Percept) -> Array:
     turn = np.arctan2(world[:, 1, 0] - world[:, 0, 1], world[:, 0, 0] + world[:, 1, 1])
     tilt = np.arccos(np.clip(world[:, 2, 2], -1.0, 1.0))
     weight = np.exp(percept.log_probability - 0.5 * (tilt / UPRIGHT_RAD) ** 2)
-    bells = _bells(wrap(turns() - turn[:, None]), percept.deviation_rad[:, None])
+    equal = turns_of(symmetry, TURNS)[:, None, None]
+    bells = _bells(wrap(turns() - turn[:, None] - equal), percept.deviation_rad[:, None]).sum(0)
     upright = weight @ (bells / bells.sum(1, keepdims=True))
     # What the modes of an object that is not upright have says nothing.
     share = upright + max(1.0 - float(upright.sum()), 0.0) / TURNS

@@ -23,7 +23,6 @@ from saccade.shared.config import CameraConfig
 from saccade.shared.errors import printable
 from saccade.shared.world.geometry import Array, pose
 from saccade.shared.world.images import Size
-from saccade.shared.world.photographs import Intrinsics
 
 __all__ = ["MAX_POSES", "Poses", "asked_of", "read_poses"]
 
@@ -38,7 +37,8 @@ class Poses:
 
     A camera that stands still has one pose for all images (STILL). Times are counted from `epoch_s`. `lenses` are those
     that the file tells of: none, one, or one for each pose. `notes` tells the user what was taken, one line each.
-    With `in_order`, images without names get the poses in the order of their names.
+    With `in_order`, images without names get the poses in the order of their names. `lens_from` names where the lenses
+    are from.
     """
 
     table: dict[Key, Array]
@@ -47,6 +47,7 @@ class Poses:
     lenses: tuple[Lens, ...] = ()
     notes: tuple[str, ...] = ()
     in_order: bool = False
+    lens_from: str = "the poses' file"
 
     @classmethod
     def still(cls, world_from_camera: Array) -> Poses:
@@ -84,17 +85,22 @@ class Poses:
         return replace(self, table={("index", k): self.table[key] for k, key in enumerate(self._in_order)},
                        notes=(*self.notes, note))
 
-    def intrinsics_px(self, size_px: Size) -> tuple[Intrinsics | None, tuple[str, ...]]:
-        """The intrinsics (fx, fy, cx, cy) that the file tells for images of this size (width, height), and notes. None
-        if it tells none. Raises SaccadeError if they are those of other images or of several cameras."""
+    def lens(self, size_px: Size) -> tuple[Lens | None, tuple[str, ...]]:
+        """The lens that the file or a CameraInfo tells of, for images of this size (width, height), and notes. None if
+        it tells none. Raises SaccadeError if it is that of other images or of several cameras."""
         lens, note = one_lens(self.lenses)
         if lens is None:
             return None, ()
-        taken = lens.of(size_px)
-        told = f"intrinsics ({', '.join(f'{x:.2f}' for x in taken)}) px are those of the poses' file"
+        taken = lens.at(size_px, self.lens_from)
+        told = f"intrinsics ({', '.join(f'{x:.2f}' for x in taken.of(size_px))}) px are those of {self.lens_from}"
         if lens.intrinsics_px is not None and lens.size_px is None:
             told += f", which does not tell their size: {size_px[0]}x{size_px[1]} pixels are taken"
         return taken, (told, *((note,) if note else ()))
+
+    @property
+    def advice(self) -> str:
+        """What to do if no image has a pose."""
+        return "give poses by the images' names, indices or times"
 
     @cached_property
     def _times_s(self) -> Array:

@@ -17,10 +17,12 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from saccade.services.camera.opencv import opencv
 from saccade.shared.errors import NAME_LIMIT, SaccadeError, printable
 from saccade.shared.world.images import MAX_PIXELS, Size, image_size, read_image
 
 WEBCAM_DIGITS = 4
+ROS_PREFIX = "ros:"  # of a topic that is heard live
 MAX_IMAGES, MAX_ENTRIES = 100_000, 1_000_000  # of a folder
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 DEFAULT_RATE_HZ = 10.0
@@ -67,7 +69,7 @@ def open_source(text: str, *, rate_hz: float = DEFAULT_RATE_HZ) -> Source:
     path = Path(text)
     if os.path.isdir(path):
         return Folder(path, rate_hz)
-    need = "give a folder of images, a video file, or a webcam such as webcam:0"
+    need = "give a folder of images, a video file, a ROS 2 bag, or a webcam such as webcam:0"
     if not os.path.isfile(path):
         what = "is neither a folder nor a file" if os.path.exists(path) else "is not there"
         raise SaccadeError(f"camera source {text} {what}: {need}")
@@ -86,9 +88,14 @@ def webcam_number(text: str) -> int | None:
     return int(match[1]) if match else None
 
 
+def is_live(text: str) -> bool:
+    """Whether a source is a device or a topic of ROS, not a file. Raises SaccadeError like `webcam_number`."""
+    return text.startswith(ROS_PREFIX) or webcam_number(text) is not None
+
+
 def absolute(text: str) -> str:
     """The source as a text that means the same in every working directory."""
-    return text if webcam_number(text) is not None else str(Path(text).resolve())
+    return text if is_live(text) else str(Path(text).resolve())
 
 
 class Folder:
@@ -266,15 +273,7 @@ def _keep_newest(capture: Any, clock: Callable[[], float], newest: queue.Queue, 
 
 def _cv2() -> Any:
     """OpenCV, imported when the first video or webcam is opened. Raises SaccadeError if it is not installed."""
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # quiet, because our own errors say what fails in one line
-    try:
-        import cv2
-    except ImportError as error:
-        raise SaccadeError(f"videos and webcams need OpenCV ({error}): pip install opencv-python-headless, or give a "
-                           "folder of images") from error
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    cv2.setNumThreads(1)  # every service uses one thread
-    return cv2
+    return opencv("videos and webcams need", ", or give a folder of images")
 
 
 def _capture(what: str | int) -> Any:

@@ -11,6 +11,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from saccade.services.camera.trajectories.lens import Lens
+from saccade.services.camera.undistorting import Undistorting
 from saccade.shared.errors import SaccadeError, told
 from saccade.shared.world.geometry import IMAGE_SIZE_PX, INTRINSICS_PX
 from saccade.shared.world.images import Size
@@ -35,14 +37,16 @@ def assumed_intrinsics(size_px: Size) -> Intrinsics:
 class VirtualCamera:
     """Turns images of `size_px` (width, height) into images of a camera with INTRINSICS_PX at the same pose.
 
-    `intrinsics_px` (fx, fy, cx, cy) are those of the real camera, without lens distortion. cx and cy are counted from
-    the corner of the first pixel; OpenCV counts from its centre, so its values are half a pixel less. Without
-    intrinsics those of `assumed_intrinsics` are used, and the output is the central square. Pixels that the real camera
-    does not see are grey; `coverage` is the share of pixels that it sees. Raises SaccadeError if the intrinsics cannot
-    be those of images of this size, or if the images cover too little of the networks' field of view.
+    `intrinsics_px` (fx, fy, cx, cy) are those of the real camera. cx and cy are counted from the corner of the first
+    pixel; OpenCV counts from its centre, so its values are half a pixel less. Without intrinsics those of
+    `assumed_intrinsics` are used, and the output is the central square. The distortion of a `lens` for images of this
+    size is removed; the lens takes the place of the intrinsics. Pixels that the real camera does not see are grey;
+    `coverage` is the share of pixels that it sees. Raises SaccadeError if the intrinsics cannot be those of images of
+    this size, or if the images cover too little of the networks' field of view.
     """
 
-    def __init__(self, size_px: Size, intrinsics_px: Sequence[float] | None = None):
+    def __init__(self, size_px: Size, intrinsics_px: Sequence[float] | None = None, *, lens: Lens | None = None):
+        intrinsics_px = lens.of(size_px) if lens else intrinsics_px
         self.size_px = size_px
         need = "give fx, fy, cx, cy of images of this size"
         try:
@@ -55,7 +59,8 @@ class VirtualCamera:
         width, height = size_px
         if not all(CENTRAL[0] <= share <= CENTRAL[1] for share in (cx / width, cy / height)):
             raise SaccadeError(f"{name}: the principal point is not near the centre of {width}x{height} pixels: {need}")
-        self._resampling = Resampling(size_px, (fx, fy, cx, cy))
+        self._resampling: Resampling | Undistorting = (
+            Undistorting(size_px, lens) if lens and lens.distorts else Resampling(size_px, (fx, fy, cx, cy)))
         self.coverage = self._resampling.coverage
         if self.coverage < MIN_COVERAGE:
             raise SaccadeError(f"{name}: images of {width}x{height} pixels would cover {self.coverage:.0%} of the "

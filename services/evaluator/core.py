@@ -25,7 +25,10 @@ class Evaluator:
 
 
 def result_of(truth: Truth) -> Result:
-    """The result of an episode whose last truth is `truth`. The errors are those of the last camera position."""
+    """The result of an episode whose last truth is `truth`. The errors are those of the last camera position.
+
+    For a symmetric target they are those to the nearest view that looks like the goal image, which the truth tells.
+    """
     azimuth, elevation, distance = errors(truth.world_from_camera[:3, 3], truth.goal_world_from_camera[:3, 3],
                                           truth.target_center_m)
     return Result(run=truth.run, episode=truth.episode, step=truth.step, scene=truth.scene, target=truth.target,

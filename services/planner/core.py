@@ -15,12 +15,14 @@ from numpy.typing import NDArray
 
 from saccade.services.planner.free_energy import Terms, expected_free_energy
 from saccade.services.planner.goal import Preference, aim, infer_preference
+from saccade.services.planner.goal_views import Side, nearest_eye
 from saccade.services.planner.motion import step_towards
 from saccade.shared.bus.messages import Action, Belief, Plan
 from saccade.shared.bus.topics import ACTION, BELIEF, GOAL_PERCEPT, PLAN, Output
 from saccade.shared.config import Config
 from saccade.shared.loop.seeding import generator
 from saccade.shared.loop.service import Inputs, Service
+from saccade.shared.model.object_card import symmetries
 from saccade.shared.model.weights import Weights
 from saccade.shared.world.geometry import (
     Array,
@@ -61,11 +63,11 @@ PUBLISHED = 64  # number of candidates in a plan message; it changes nothing tha
 class Planner:
     """Turns beliefs into plans and actions.
 
-    Raises SaccadeError if the weights are missing or damaged, or if they lack an object.
+    Raises SaccadeError if the weights are missing or damaged, if they lack an object, or if a card is damaged.
     """
 
     def __init__(self, config: Config, names: tuple[str, ...]):
-        self.config, self.names = config, names
+        self.config, self.names, self.symmetry = config, names, symmetries(config.scene.objects, names)
         self.moved_by_others = config.camera.source is not None
         self.sizes_m = {card.name: card.size_m for card in Weights(config.weights).cards_of(names)}
 
@@ -108,7 +110,7 @@ class Planner:
         translation, rotation = step_towards(camera, heading, spheres, self.config.planner.step_m)
         if declared:  # the agent is judged at the pose at which it says that it has arrived, so it must not move
             translation, rotation = np.zeros(3), np.zeros(3)
-        plan = self._published(chosen, stamp, camera, beliefs, declared)
+        plan = self._published(chosen, stamp, camera, beliefs, spheres, declared)
         yield Output(PLAN, plan)
         yield Output(ACTION, Action(run=plan.run, episode=plan.episode, step=plan.step, translation_m=translation,
                                     rotation_rad=rotation, arrived=declared))
@@ -163,13 +165,14 @@ class Planner:
         eyes, gazes = self._candidates(beliefs, rng)
         if found is not None and (log_posterior := beliefs[found.target].goal_log_posterior) is not None:
             target = beliefs[found.target]
-            best = self._goal_viewpoint(found, target, _peak(target.mean_m, log_posterior, found.range_m))
-            eyes, gazes = np.vstack([eyes, best[:3, 3]]), np.vstack([gazes, target.mean_m])
+            eye = self._goal_eye(target, log_posterior, found.range_m, camera, spheres)
+            best, side = self._goal_viewpoint(found, target, eye), self._side(target, eye)
+            eyes, gazes = np.vstack([side.eyes(eyes), best[:3, 3]]), np.vstack([gazes, target.mean_m])
         eyes = np.clip(eyes, LOWER_M, UPPER_M)
         terms = expected_free_energy(eyes, gazes, beliefs, found, self.config.planner.information_weight)
         if found is not None:  # after each wrong viewpoint, pose and scale are trusted less, so others are tried
             cost = (terms.pose + terms.scale) / self._doubt + terms.position + terms.information
-            cost = cost + self._visited_cost(eyes, beliefs[found.target].mean_m)
+            cost = cost + self._visited_cost(eyes, self._side(beliefs[found.target], eyes[-1]))
         else:  # of equally informative viewpoints the nearest is taken
             cost = terms.total + NEARER * np.linalg.norm(eyes - camera[:3, 3], axis=1)
         chosen = int(np.argmin(cost))
@@ -220,17 +223,25 @@ class Planner:
             eyes[:third] = gazes[:third] + reach[:, None] * away
         return eyes, gazes
 
-    def _visited_cost(self, eyes: Array, center: Array) -> Array:
-        """Cost [N] (nats) of views from `eyes` [N, 3] of `center` [3] that are like views that were not the goal's."""
+    def _side(self, target: Belief, eye: Array) -> Side:
+        return Side(target.mean_m, self.symmetry[target.object], eye)
+
+    def _visited_cost(self, eyes: Array, side: Side) -> Array:
+        """Cost [N] (nats) of views of the target from `eyes` [N, 3] that are like views that were not the goal's."""
         cost = np.zeros(len(eyes))
         if not self.visited:
             return cost
-        rotations = rotation_towards(center - eyes)
-        for seen in self.visited:
+        rotations = rotation_towards(side.center - eyes)
+        for seen in map(side.pose, self.visited):
             far = ((eyes - seen[:3, 3]) ** 2).sum(1) / VISITED_M ** 2
             turned = (rotation_angle(rotations, seen[:3, :3]) / VISITED_RAD) ** 2
             cost += VISITED_COST * np.exp(-0.5 * (far + turned))
         return cost
+
+    def _goal_eye(self, target: Belief, log_posterior: NDArray[np.float32], range_m: float, camera: Array,
+                  spheres: Spheres) -> Array:
+        eye = _peak(target.mean_m, log_posterior, range_m)
+        return nearest_eye(eye, target.mean_m, self.symmetry[target.object], camera, spheres)
 
     def _goal_viewpoint(self, preference: Preference, target: Belief, eye: Array) -> Array:
         """The camera pose [4, 4] at `eye` [3] that shows the target at the pixel where the goal image shows it.
@@ -251,11 +262,12 @@ class Planner:
             goal_confidence=self.confidence,
             arrived=False)
 
-    def _published(self, plan: Plan, stamp: Belief, camera: Array, beliefs: dict[str, Belief], declared: bool) -> Plan:
+    def _published(self, plan: Plan, stamp: Belief, camera: Array, beliefs: dict[str, Belief], spheres: Spheres,
+                   declared: bool) -> Plan:
         """The chosen plan with the step, the distance to the goal and the declaration of the present step."""
         distance, target = -1.0, beliefs.get(plan.target)
         if self.preference is not None and target is not None and target.goal_log_posterior is not None:
-            eye = _peak(target.mean_m, target.goal_log_posterior, self.preference.range_m)
+            eye = self._goal_eye(target, target.goal_log_posterior, self.preference.range_m, camera, spheres)
             distance = float(np.linalg.norm(eye - camera[:3, 3]))
         return replace(plan, step=stamp.step, believed_distance_m=distance, arrived=declared)
 

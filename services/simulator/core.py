@@ -89,8 +89,10 @@ class Simulator:
         present = self.scene.on_table
         spheres = spheres_around([p.center_m for p in present], [self.world.meshes[p.name].size_m for p in present])
         judged = self.goal_rgb is None and not self.explore
+        target = self.scene.target_placed
         self.state = Episode(self.scene.goal_world_from_camera, spheres, max_steps=self.max_steps, judged=judged,
-                             until=self.until)
+                             until=self.until, center_m=target.center_m,
+                             symmetry=self.world.meshes[target.name].symmetry)
         goal = Goal(**self._stamp(), rgb=self._goal_image(goal_look), intrinsics_px=self.world.intrinsics_px)
         self._place(present, self.look)
         return [Output(GOAL, goal), *self._outputs()]

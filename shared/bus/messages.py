@@ -238,7 +238,8 @@ class Truth(Message):
     world_from_camera: Annotated[np.ndarray, array("f8", 4, 4)]
     """Pose of the camera."""
     goal_world_from_camera: Annotated[np.ndarray, array("f8", 4, 4)]
-    """Pose of the camera that took the goal image."""
+    """Pose of the camera that took the goal image. If the target is symmetric, it is turned with it so that it is the
+    nearest one to the camera of all that show the same."""
     success: bool
     """The camera is, or was, within the tolerance of the goal's pose."""
     done: bool

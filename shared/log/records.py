@@ -123,9 +123,10 @@ def within(data: bytes, kinds: tuple[int, ...] = (Opcode.SCHEMA, Opcode.CHANNEL,
             yield parse(opcode, data[start:offset])
 
 
-def records(stream: BinaryIO, *, sums: bool = True) -> Iterator[Any]:
+def records(stream: BinaryIO, *, sums: bool = True, schemas: bool = False) -> Iterator[Any]:
     """Yields the header, channels, messages, metadata and attachments of a file, in the order of the file, including
-    those in chunks. Raises one of DAMAGE where the file is cut or damaged."""
+    those in chunks, and with `schemas` also these. Raises one of DAMAGE where the file is cut or damaged."""
+    more = (Opcode.SCHEMA,) if schemas else ()
     opener, size = Opener(sums=sums), os.fstat(stream.fileno()).st_size
     if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
         raise ValueError("no MCAP file")
@@ -137,8 +138,8 @@ def records(stream: BinaryIO, *, sums: bool = True) -> Iterator[Any]:
         if stream.tell() + length > size:
             raise EndOfFile()
         if opcode == Opcode.CHUNK:
-            yield from within(opener.data(parse(opcode, stream.read(length))), (Opcode.CHANNEL, Opcode.MESSAGE))
-        elif opcode == Opcode.MESSAGE or opcode in WANTED:
+            yield from within(opener.data(parse(opcode, stream.read(length))), (Opcode.CHANNEL, Opcode.MESSAGE, *more))
+        elif opcode == Opcode.MESSAGE or opcode in WANTED or opcode in more:
             body = stream.read(length)
             if sums and opcode == Opcode.ATTACHMENT:
                 check_attachment(body)

@@ -282,6 +282,7 @@ class _Loop:
             self.health.state = before
             self.health.at = self._stepper.at
             self.health.skipped = self._stepper.skipped + getattr(self._stepper.core, "skipped", 0)
+            self.health.unusable = getattr(self._stepper.core, "refused", 0)
         return True
 
     def _publish(self, outputs: list[Output]) -> None:

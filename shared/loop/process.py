@@ -112,6 +112,7 @@ class Health:
     received: int = 0
     published: int = 0
     refused: int = 0
+    unusable: int = 0  # messages from elsewhere that a source could not use; they count as refused
     skipped: int = 0
     gaps: int = 0
     milliseconds: float = 0.0
@@ -132,7 +133,8 @@ class Health:
         """Returns the status message for the bus."""
         run, episode, step = self.at
         counted = {name: min(getattr(self, name), MOST_COUNTED)
-                   for name in ("received", "published", "refused", "skipped", "gaps")}
+                   for name in ("received", "published", "skipped", "gaps")}
+        counted["refused"] = min(self.refused + self.unusable, MOST_COUNTED)
         return Status(run=run, episode=episode, step=step, seq=seq, service=self.service, state=self.state, **counted,
                       milliseconds=self.milliseconds, note=self.note)
 

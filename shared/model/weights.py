@@ -214,14 +214,23 @@ def weights_in_use(config: Config) -> Weights:
     return weights
 
 
+def bank_file(name: str) -> str:
+    """The name of the file with an object's bank."""
+    return f"{name}{BANK}.safetensors"
+
+
 def write_weights(folder: Path, states: Mapping[str, Mapping[str, ArrayLike]], cards: tuple[ObjectCard, ...],
-                  facts: dict[str, Any], banks: Mapping[str, dict[str, NDArray[Any]]] | None = None) -> None:
-    """Writes the states in half precision, the banks as they are, and the manifest with their hashes. Raises
-    SaccadeError if this fails; weights that were there before then stay as they were."""
+                  facts: dict[str, Any], banks: Mapping[str, dict[str, NDArray[Any]]] | None = None,
+                  kept: Mapping[str, str] | None = None) -> dict[str, str]:
+    """Writes the states in half precision, the banks as they are, and the manifest with their hashes. `kept` are the
+    hashes of files that belong to the weights and stay as they are. Returns all hashes, by file.
+
+    Raises SaccadeError if this fails; weights that were there before then stay as they were.
+    """
     files = {f"{stem}.safetensors": save({key: np.asarray(value).astype(np.float16, order="C")
                                           for key, value in state.items()}) for stem, state in states.items()}
-    files |= {f"{name}{BANK}.safetensors": save(arrays) for name, arrays in (banks or {}).items()}
-    hashes = {name: hashlib.sha256(data).hexdigest() for name, data in files.items()}
+    files |= {bank_file(name): save(arrays) for name, arrays in (banks or {}).items()}
+    hashes = {**(kept or {}), **{name: hashlib.sha256(data).hexdigest() for name, data in files.items()}}
     objects = {card.name: {"size_m": [round(float(x), 6) for x in card.size_m], "crop_side_m": card.crop_side_m}
                for card in cards}
     manifest = {**facts, "objects": objects, "sha256": hashes}
@@ -229,3 +238,4 @@ def write_weights(folder: Path, states: Mapping[str, Mapping[str, ArrayLike]], c
     with writing(folder, "weights"):
         folder.mkdir(parents=True, exist_ok=True)
         replace_all(folder, files)
+    return hashes

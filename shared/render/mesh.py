@@ -16,6 +16,7 @@ from PIL import Image
 from saccade.shared.errors import SaccadeError
 from saccade.shared.files import MIB, opened
 from saccade.shared.world.images import opened_image
+from saccade.shared.world.symmetry import NONE
 
 MESH_FILE = "textured.obj"
 MAX_FILE_BYTES = 64 * MIB
@@ -30,7 +31,8 @@ TEXTURE_MAX_PX = 2048  # with a larger texture a texel would be far smaller than
 class Mesh:
     """A textured triangle mesh. The centre of its box is at the origin.
 
-    It has vertices_m [V, 3], texture coordinates [V, 2] (v points up), faces [F, 3] and a texture [H, W, 3] uint8.
+    It has vertices_m [V, 3], texture coordinates [V, 2] (v points up), faces [F, 3] and a texture [H, W, 3] uint8. Its
+    `symmetry` is that about its up axis (`shared/world/symmetry.py`).
     """
 
     name: str
@@ -38,6 +40,7 @@ class Mesh:
     texcoords: NDArray[np.float32]
     faces: NDArray[np.int32]
     texture: NDArray[np.uint8]
+    symmetry: int = NONE
 
     @property
     def size_m(self) -> NDArray[np.float64]:

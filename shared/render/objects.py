@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import os
 import re
+from dataclasses import replace
 from pathlib import Path
 
 from saccade.shared.config import SceneConfig, set_folder
 from saccade.shared.errors import SaccadeError, told
+from saccade.shared.model.object_card import symmetry_in
 from saccade.shared.render.mesh import MESH_FILE, Mesh, read_obj
 from saccade.shared.render.pantry import PANTRY_NAMES, make_mesh
 from saccade.shared.wording import WORLD
@@ -56,7 +58,10 @@ def load_mesh(object_set: str, name: str) -> Mesh:
         raise SaccadeError(f"object {name!r} is not in {object_set!r}: choose from {', '.join(names_of(object_set))}")
     if object_set == "pantry":
         return make_mesh(name)
-    return read_obj((set_folder(object_set) or ycb_folder()) / name, name)
+    folder = set_folder(object_set)
+    if folder is None:
+        return read_obj(ycb_folder() / name, name)
+    return replace(read_obj(folder / name, name), symmetry=symmetry_in(folder / name))
 
 
 def names_in_use(config: SceneConfig) -> tuple[str, ...]:

@@ -91,6 +91,7 @@ class World:
         self.meshes = {mesh.name: mesh for mesh in meshes}
         self.size_px = size_px
         self.model = _build(meshes)
+        self.model.vis.global_.offwidth = self.model.vis.global_.offheight = max(IMAGE_SIZE_PX, size_px)
         self.data = mujoco.MjData(self.model)
         self._rig = self.model.body("camera").mocapid[0]
         self._mocap = {mesh.name: self.model.body(mesh.name).mocapid[0] for mesh in meshes}

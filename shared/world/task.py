@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from saccade.shared.errors import SaccadeError, told
 from saccade.shared.world.geometry import Array, direction, look_at, rotation_angle, rotation_xyz, spherical, wrap
+from saccade.shared.world.symmetry import NONE, turned_about, turns_of
 
 MAX_STEPS = 350
 ACTION_LIMIT = 0.5  # metres and radians, each component
@@ -110,6 +111,28 @@ def success(world_from_camera: ArrayLike, goal_world_from_camera: ArrayLike) -> 
     return bool(near and rotation_angle(camera[:3, :3], goal[:3, :3]) < SUCCESS_ROTATION_RAD)
 
 
+def equal_goals(goal_world_from_camera: ArrayLike, center_m: ArrayLike, symmetry: int, spheres: Spheres) -> Array:
+    """All poses [N, 4, 4] from which a target at `center_m` [3] looks as from the goal pose [4, 4], which is the first.
+
+    Those that the camera cannot come near to, because another object or the end of the workspace is in the way, are
+    left out.
+    """
+    goals = turned_about(center_m, goal_world_from_camera, turns_of(symmetry)[1:])
+    gaps = np.linalg.norm(clip(goals[:, :3, 3], spheres) - goals[:, :3, 3], axis=1)
+    first = np.array(goal_world_from_camera, dtype=np.float64)[None]
+    return np.concatenate([first, goals[gaps < SUCCESS_TRANSLATION_M]])
+
+
+def nearest_goal(world_from_camera: ArrayLike, goals: Array) -> Array:
+    """The goal pose [4, 4] of [N, 4, 4] to which a camera pose [4, 4] is nearest, in units of both tolerances: if the
+    camera is within those of any goal, it is within those of this one."""
+    if len(goals) == 1:
+        return goals[0]
+    camera = np.asarray(world_from_camera)
+    apart = np.linalg.norm(goals[:, :3, 3] - camera[:3, 3], axis=1) / SUCCESS_TRANSLATION_M
+    return goals[np.argmin(np.maximum(apart, rotation_angle(goals[:, :3, :3], camera[:3, :3]) / SUCCESS_ROTATION_RAD))]
+
+
 def errors(position: ArrayLike, goal_position: ArrayLike, target_center: ArrayLike) -> tuple[float, float, float]:
     """Returns (|azimuth| rad, |elevation| rad, |range| m) between two camera positions [3], as seen from the centre of
     the target [3]."""
@@ -124,12 +147,13 @@ class Episode:
 
     The episode ends when the camera is at the goal, as in the paper. With `until="declared"` it ends when the agent
     first says that it is there. Both also end after `max_steps`. With `judged=False` there is no goal to judge by, and
-    no episode succeeds.
+    no episode succeeds. If the target at `center_m` [3] is symmetric, any view that looks like the goal's is the goal.
     """
 
     def __init__(self, goal_world_from_camera: ArrayLike, spheres: Spheres, *, max_steps: int = MAX_STEPS,
-                 judged: bool = True, until: Literal["reached", "declared"] = "reached"):
-        self.goal = np.asarray(goal_world_from_camera, dtype=np.float64)
+                 judged: bool = True, until: Literal["reached", "declared"] = "reached",
+                 center_m: ArrayLike = (0.0, 0.0, 0.0), symmetry: int = NONE):
+        self._goals = equal_goals(goal_world_from_camera, center_m, symmetry, spheres)
         self.spheres, self.max_steps, self.judged, self.until = spheres, max_steps, judged, until
         self.reached = False  # whether the camera has been at the goal, at any step
         self.step, self.declared, self.declared_true = 0, False, False
@@ -147,6 +171,11 @@ class Episode:
         self.reached |= self.success
         if arrived and not self.declared:
             self.declared, self.declared_true = True, self.success
+
+    @property
+    def goal(self) -> Array:
+        """The goal pose [4, 4]. If several views look like the goal image, it is the nearest one to the camera."""
+        return nearest_goal(self.camera, self._goals)
 
     @property
     def success(self) -> bool:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from saccade.services.camera.trajectories.distortion import distorted, undistorted
 from saccade.shared.errors import SaccadeError
 from saccade.shared.world.geometry import Array
 from saccade.shared.world.images import Size
@@ -40,18 +41,39 @@ class Lens:
         """Whether the lens differs from a pinhole."""
         return self.fisheye or any(value for _, value in self.distortion)
 
-    def of(self, size_px: Size) -> Intrinsics:
+    def of(self, size_px: Size, told_by: str = "the poses' file") -> Intrinsics:
         """The intrinsics for images of `size_px`. Raises SaccadeError if those images have another shape."""
         if self.intrinsics_px is None:
             focal = size_px[0] / 2 / math.tan((self.angle_x_rad or 1.0) / 2)
             return focal, focal, size_px[0] / 2, size_px[1] / 2
         width, height = self.size_px or size_px
         if abs(size_px[0] * height / (size_px[1] * width) - 1) > SAME_SHAPE:
-            raise SaccadeError(f"the poses' intrinsics are for images of {width}x{height} pixels, the source has "
+            raise SaccadeError(f"the intrinsics of {told_by} are for images of {width}x{height} pixels, the source has "
                                f"{size_px[0]}x{size_px[1]}: give camera.intrinsics_px, or images of that shape")
         x, y = size_px[0] / width, size_px[1] / height
         fx, fy, cx, cy = self.intrinsics_px
         return fx * x, fy * y, cx * x, cy * y
+
+    def at(self, size_px: Size, told_by: str = "the poses' file") -> Lens:
+        """The same lens for images of `size_px`. Raises SaccadeError as `of` does."""
+        return Lens(self.of(size_px, told_by), size_px, self.distortion, self.fisheye)
+
+    def pixels(self, rays: Array) -> Array:
+        """Pixels [N, 2] where the lens shows rays (x, y) [N, 2] at depth 1, y down. The intrinsics must be known."""
+        fx, fy, cx, cy = self._known
+        return distorted(rays, dict(self.distortion), fisheye=self.fisheye) * (fx, fy) + (cx, cy)
+
+    def rays(self, pixels: Array) -> Array:
+        """Rays (x, y) [N, 2] at depth 1, y down, that the lens shows at pixels [N, 2]. NaN where it shows none. The
+        intrinsics must be known."""
+        fx, fy, cx, cy = self._known
+        return undistorted((pixels - (cx, cy)) / (fx, fy), dict(self.distortion), fisheye=self.fisheye)
+
+    @property
+    def _known(self) -> Intrinsics:
+        if self.intrinsics_px is None:
+            raise ValueError("a lens without intrinsics: give it an image size with `at`")
+        return self.intrinsics_px
 
     def corner_px(self) -> float:
         """How far the distortion moves a pixel at the image's corners, at most (pixels). It may be infinite."""
@@ -62,26 +84,11 @@ class Lens:
         corners = np.array([[u, v] for u in (0.0, width) for v in (0.0, height)])
         rays = (corners - (cx, cy)) / (fx, fy)
         with np.errstate(all="ignore"):  # a polynomial of wrong coefficients goes anywhere
-            moved = np.linalg.norm((self._distorted(rays) - rays) * (fx, fy), axis=1)
+            moved = np.linalg.norm(self.pixels(rays) - corners, axis=1)
         return float(moved.max()) if np.isfinite(moved).all() else math.inf
 
-    def _distorted(self, rays: Array) -> Array:
-        """Where the lens shows rays (x, y) [N, 2] at depth 1."""
-        k = dict(self.distortion)
-        k1, k2, k3, k4, k5, k6, p1, p2 = (k.get(name, 0.0) for name in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2"))
-        square = (rays ** 2).sum(1, keepdims=True)
-        if self.fisheye:
-            radius = np.maximum(np.sqrt(square), 1e-12)
-            angle = np.arctan(radius)
-            a = angle ** 2
-            return rays * angle * (1 + a * (k1 + a * (k2 + a * (k3 + a * k4)))) / radius
-        radial = (1 + square * (k1 + square * (k2 + square * k3))) / (1 + square * (k4 + square * (k5 + square * k6)))
-        product = (rays[:, :1] * rays[:, 1:])
-        tangential = 2 * product * (p1, p2) + (p2, p1) * (square + 2 * rays ** 2)
-        return rays * radial + tangential
-
     def note(self) -> str | None:
-        """What the user must know about the distortion, or None if there is none."""
+        """What the distortion is, in words, or None if there is none."""
         if not self.distorts:
             return None
         kind = "the fisheye distortion" if self.fisheye else "the distortion"
@@ -90,8 +97,7 @@ class Lens:
         size = f"up to {corner_px:.1f} pixels" if corner_px < MAX_SHIFT_PX else f"more than {MAX_SHIFT_PX:.0f} pixels"
         if self.intrinsics_px is None:
             size = "by an unknown number of pixels"
-        return (f"{kind} of the lens{f' ({told})' if told else ''} is not removed yet: {size} at the image's corner; "
-                "rectify the images first")
+        return f"{kind} of the lens{f' ({told})' if told else ''}, {size} at the image's corner"
 
 
 def lens(numbers: Mapping[str, float], size_px: tuple[float, float] | None = None, *, fisheye: bool = False) -> Lens:
@@ -127,7 +133,7 @@ def one_lens(lenses: Sequence[Lens]) -> tuple[Lens | None, str | None]:
         raise SaccadeError(f"the poses' focal lengths go from {low:.0f} to {high:.0f} px: give the poses of one "
                            "camera, or camera.intrinsics_px")
     fx, fy, cx, cy = map(float, np.median(numbers, axis=0))
-    first = max(different, key=Lens.corner_px)
+    first = min(lenses, key=lambda x: abs(x.intrinsics_px[0] - fx) if x.intrinsics_px else math.inf)
     note = f"the focal length goes from {low:.1f} to {high:.1f} px: the median is used"
     median = Lens((fx, fy, cx, cy), first.size_px, first.distortion, first.fisheye)
     return median, note if spread > TOLD_SPREAD else None

@@ -167,6 +167,4 @@ def _notes(stored: Stored, asked: Asked, up: str | None, epoch_s: float) -> list
         notes.append(f"applied_transform {done}")
     if stored.format not in ("json-lines", "tum"):
         notes.append("the origin is the file's; the agent expects it on the table, whose top is at z = 0")
-    if stored.lenses and (note := max(set(stored.lenses), key=lambda x: (x.distorts, x.corner_px())).note()):
-        notes.append(note)
     return notes

@@ -1,0 +1,66 @@
+"""The camera's pose at each image, from a printed board that stands on the table."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+from saccade.services.camera.board_pose import Doubtful, measure
+from saccade.services.camera.charuco import Board, Corners, Finder
+from saccade.services.camera.pose_filter import PoseFilter
+from saccade.services.camera.sources import SourceImage
+from saccade.services.camera.trajectories.lens import Lens
+from saccade.shared.world.geometry import Array
+
+REFUSED = "the camera could hardly have moved there since the last image"
+
+
+class BoardPoses:
+    """Poses world_from_camera [4, 4] (OpenGL) in the frame of a board, from the images themselves.
+
+    `lens` is that of the images, with its intrinsics. With `smooth` the images follow one another in time, and a filter
+    smooths the poses; otherwise each image is judged by itself. `why_not` counts the reasons of images without a pose.
+    Raises SaccadeError if OpenCV is missing.
+    """
+
+    def __init__(self, board: Board, lens: Lens, path: Path, *, smooth: bool):
+        self.board, self.lens, self._path = board, lens, path
+        self._finder = Finder(board)
+        self._filter = PoseFilter() if smooth else None
+        self.why_not: Counter[str] = Counter()
+
+    def of(self, image: SourceImage) -> Array | None:
+        """The camera's pose [4, 4] at an image. None if the board does not show it beyond doubt."""
+        return self.from_corners(self._finder.find(image.rgb), image.time_s)
+
+    def from_corners(self, corners: Corners, time_s: float) -> Array | None:
+        """The camera's pose [4, 4] from the corners that an image of this time shows, or None."""
+        measured = measure(self.board, corners, self.lens)
+        if isinstance(measured, Doubtful):
+            self.why_not[measured.reason] += 1
+            return None
+        if self._filter is None:
+            return measured.world_from_camera
+        smoothed = self._filter.take(time_s, measured)
+        if smoothed is None:
+            self.why_not[REFUSED] += 1
+        return smoothed
+
+    def end_before(self, image: SourceImage) -> bool:
+        """Whether no later image can have a pose. The board may come back into view at any time."""
+        return False
+
+    def matched(self, names: Sequence[str]) -> BoardPoses:
+        """The same: the names of the images tell nothing."""
+        return self
+
+    @property
+    def advice(self) -> str:
+        """What to do if no image has a pose."""
+        reason = self.why_not.most_common(1)[0][0] if self.why_not else "there is no image"
+        return (f"mostly because {reason}; print the board that belongs to this file, lay it flat, and let most of it "
+                "be seen")
+
+    def __str__(self) -> str:
+        return f"the board {self._path}"
