@@ -155,7 +155,7 @@ def test_what_is_added_is_learnt_and_leaves_the_others_as_they_were(home, consol
     assert weights.names == ("rice", "tea", "oil")
     assert weights.networks.folder == WEIGHTS / OPEN
     assert len(bank_of("oil", weights.bank("oil")).pictures) > 100
-    assert (folder / "oil.bank.safetensors").stat().st_size < 600_000
+    assert (folder / "oil.bank.safetensors").stat().st_size < 800_000
     banks = {name: bank_in(weights, name) for name in weights.names}
     alike = {pair.other: pair.similar for pair in pairs_of("tea", banks)}
     assert set(alike) == {"rice", "oil"}

@@ -16,6 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from saccade.services.perception.likeness import COHORT
+from saccade.services.perception.local_features import SHA256
 from saccade.services.perception.paper import CROP_SIDE_M
 from saccade.shared.errors import SaccadeError
 from saccade.shared.files import replace_whole, writing
@@ -164,7 +165,7 @@ def _export_open(run_dir: Path, config: TrainingConfig, weights_dir: Path) -> No
         states = {part: state for part, (_, state) in trained.items()}
         cohort, log_odds = judged(run_dir, config, states)
         write_weights(networks, {**states, COHORT: {"vectors": cohort}}, (), {
-            "architecture": config.architecture, "calibration": asdict(log_odds),
+            "architecture": config.architecture, "calibration": asdict(log_odds), "local_features": SHA256,
             "data": "views and rendered tables of scanned objects, the pantry's, and of "
             f"{config.groceries} groceries made by code", "training": config.model_dump(mode="json"), "losses": losses,
             "commits": {part: facts.get("commit", "unknown") for part, (facts, _) in trained.items()},

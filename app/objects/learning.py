@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from saccade.app.objects.cards import digest
-from saccade.services.perception.local_features import SHA256
 from saccade.shared.config import WEIGHTS, learned_folder
 from saccade.shared.errors import SaccadeError
 from saccade.shared.files import writing
@@ -42,7 +41,6 @@ def learn(objects: str, folder: Path, show: Callable[[str, int, int], None]) -> 
     Raises SaccadeError if the networks are damaged, or if the banks cannot be written.
     """
     networks, target = Weights(WEIGHTS / OPEN), learned_folder(objects, OPEN)
-    basis = f"{networks.basis}+{SHA256}"  # banks are made by the networks, and by local features
     names, refused = own_names(folder), dict[str, str]()
     digests: dict[str, str] = {}
     for name in names:
@@ -50,7 +48,7 @@ def learn(objects: str, folder: Path, show: Callable[[str, int, int], None]) -> 
             digests[name] = digest(folder / name)
         except SaccadeError as error:
             refused[name] = str(error)
-    cards, hashes, is_whole = _known(target, basis, digests)
+    cards, hashes, is_whole = _known(target, networks.basis, digests)
     missing = [name for name in digests if name not in cards]
     make = BankMaker(networks)
     learnt = list[str]()
@@ -64,11 +62,11 @@ def learn(objects: str, folder: Path, show: Callable[[str, int, int], None]) -> 
             continue
         bank = make(mesh).arrays()
         cards[name] = ObjectCard(name, mesh.size_m, crop_side_m(mesh.size_m))
-        hashes = _write(target, basis, digests, cards, {name: bank}, hashes)
+        hashes = _write(target, networks.basis, digests, cards, {name: bank}, hashes)
         learnt.append(name)
         show(name, done + 1, len(missing))
     if not learnt and not is_whole and cards:
-        _write(target, basis, digests, cards, {}, hashes)
+        _write(target, networks.basis, digests, cards, {}, hashes)
     _forget(target, cards)
     return Learnt(learnt, refused)
 

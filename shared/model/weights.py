@@ -94,8 +94,10 @@ class Weights:
 
     @property
     def basis(self) -> str:
-        """What says which networks these are: a hash of the hashes of their files."""
-        return hashlib.sha256("".join(sorted(self.hashes.values())).encode()).hexdigest()
+        """What says which networks these are: a hash of the hashes of their files, and of that of the local features
+        which banks hold."""
+        others = str(self.manifest.get("local_features", ""))
+        return hashlib.sha256("".join([*sorted(self.hashes.values()), others]).encode()).hexdigest()
 
     @property
     def names(self) -> tuple[str, ...]:
