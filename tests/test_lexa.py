@@ -135,7 +135,7 @@ def test_an_agent_runs_on_the_bus_and_in_one_process_alike_and_is_replayed(agent
     logs = {}
     given = {"perception.weights": finished / "weights"} if agent == "lexa" else {}
     for kind in ("zenoh", "local"):
-        config = configured(None, EPISODE | {"bus.kind": kind} | given, [], agent)
+        config, _ = configured(None, EPISODE | {"bus.kind": kind} | given, [], agent)
         run(config, agent=agent, out=tmp_path / kind / "same", plain=True, console=Console(file=io.StringIO()))
         logs[kind] = [entry.payload for entry in RunReader(tmp_path / kind / "same" / "run.mcap").entries()
                       if entry.topic != STATUS]
@@ -156,6 +156,6 @@ def test_an_agent_runs_on_the_bus_and_in_one_process_alike_and_is_replayed(agent
 
 def test_weights_of_another_architecture_get_one_line(tmp_path, finished):
     write_random_weights(tmp_path / "w", "pantry", NAMES)
-    config = configured(None, EPISODE | {"bus.kind": "local", "perception.weights": tmp_path / "w"}, [], "lexa")
+    config, _ = configured(None, EPISODE | {"bus.kind": "local", "perception.weights": tmp_path / "w"}, [], "lexa")
     with pytest.raises(SaccadeError, match=r"architecture 'default', and this agent needs 'lexa'"):
         run(config, agent="lexa", out=tmp_path / "r", plain=True, console=Console(file=io.StringIO()))

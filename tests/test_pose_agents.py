@@ -131,7 +131,7 @@ def test_training_continues_as_if_it_had_not_been_interrupted_and_its_weights_se
 def test_an_agent_runs_on_the_bus_and_in_one_process_alike_and_is_replayed(agent, tmp_path, weights):
     logs = {}
     for kind in ("zenoh", "local"):
-        config = configured(None, EPISODE | {"bus.kind": kind, "perception.weights": weights}, [], agent)
+        config, _ = configured(None, EPISODE | {"bus.kind": kind, "perception.weights": weights}, [], agent)
         out = tmp_path / kind / "same"
         run(config, agent=agent, out=out, plain=True, console=Console(file=io.StringIO()))
         logs[kind] = logged(out / "run.mcap")
@@ -149,7 +149,7 @@ def test_an_agent_runs_on_the_bus_and_in_one_process_alike_and_is_replayed(agent
 def test_an_agents_preset_gives_way_to_what_the_user_says(tmp_path, weights):
     path = tmp_path / "mine.toml"
     path.write_text("[simulator]\npublish_depth = false\n[planner]\nstep_m = 0.03\n")
-    config = configured(path, {"perception.weights": weights}, ["seed=3"], "posecnn")
+    config, _ = configured(path, {"perception.weights": weights}, ["seed=3"], "posecnn")
     assert (config.simulator.publish_depth, config.planner.step_m, config.seed) == (False, 0.03, 3)
     assert config.services.planner == "saccade.services.planner.follow"
 
@@ -157,7 +157,7 @@ def test_an_agents_preset_gives_way_to_what_the_user_says(tmp_path, weights):
 @pytest.mark.parametrize(("agent", "of"), [("posecnn", "default"), ("sceneccn", "posecnn")])
 def test_weights_of_another_architecture_get_one_line(agent, of, tmp_path):
     write_random_weights(tmp_path / "w", "pantry", NAMES, of)
-    config = configured(None, EPISODE | {"perception.weights": tmp_path / "w"}, [], agent)
+    config, _ = configured(None, EPISODE | {"perception.weights": tmp_path / "w"}, [], agent)
     with pytest.raises(SaccadeError, match=f"{tmp_path / 'w'}.*{of}.*{'posecnn' if of == 'default' else 'default'}"):
         local_pairs(agent, config)
 
@@ -203,7 +203,7 @@ def test_where_the_target_is_not_seen_the_camera_stops():
 def test_templates_find_how_an_object_is_turned():
     """From a dozen directions, with the shipped detector: three quarters within half the task's tolerance."""
     names = ("cereal_box", "rice_box")
-    config = configured(None, {"scene.names": list(names)}, [], "render-and-compare")
+    config, _ = configured(None, {"scene.names": list(names)}, [], "render-and-compare")
     matcher = TemplateMatcher(Weights(config.weights), "pantry", names, 2)
     world, right = World(tuple(load_mesh("pantry", name) for name in names)), 0
     for n in range(12):
@@ -217,7 +217,7 @@ def test_templates_find_how_an_object_is_turned():
 
 
 def test_who_renders_and_compares_runs_within_one_process_and_is_replayed(tmp_path):
-    config = configured(None, EPISODE | {"simulator.max_steps": 2, "bus.kind": "local"}, [], "render-and-compare")
+    config, _ = configured(None, EPISODE | {"simulator.max_steps": 2, "bus.kind": "local"}, [], "render-and-compare")
     run(config, agent="render-and-compare", out=tmp_path / "r", plain=True, console=Console(file=io.StringIO()))
     assert_replayed(tmp_path / "r" / "run.mcap", tmp_path / "replay", "perception", "belief", "planner")
     poses = [m.camera_from_object for _, _, m in RunReader(tmp_path / "r" / "run.mcap") if isinstance(m, Percept)]
