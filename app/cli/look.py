@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from saccade.app.cli.options import AGENT_DEFAULT, Names, Objects, WeightsFolder, wide
+from saccade.app.cli.options import Names, Objects, WeightsFolder, wide
 from saccade.shared.errors import SaccadeError
 from saccade.shared.log.folder import PICTURE_NAME
 
@@ -91,7 +91,8 @@ def film(log: Log, out: Annotated[Path, typer.Argument(help="File of the film: O
 def see(photos: Annotated[list[Path], typer.Argument(metavar="PHOTO...", help="Photographs: PNG or JPEG.")], *,
         objects: Objects = None, names: Names = None,
         agent: Annotated[str | None, typer.Option(
-            help="Whose networks look: sceneccn, open, paper or posecnn.", show_default=AGENT_DEFAULT)] = None,
+            help="Whose networks look: open, sceneccn, paper or posecnn.",
+            show_default="open, which was made for photographs; sceneccn for --weights")] = None,
         weights: WeightsFolder = None,
         intrinsics: Annotated[str | None, typer.Option(
             help="Intrinsics of the photographs in their own size, in pixels.", metavar="fx,fy,cx,cy",
@@ -105,10 +106,13 @@ def see(photos: Annotated[list[Path], typer.Argument(metavar="PHOTO...", help="P
 
     from saccade.app.cli.texts import configured, numbers, split_names
     from saccade.app.look.see import see as look_at
+    from saccade.app.run.registry import AGENT_OF_PHOTOGRAPHS
 
     given = numbers(intrinsics)
     if given is not None and len(given) != 4:
         raise SaccadeError(f"--intrinsics {intrinsics!r}: write fx,fy,cx,cy, such as 615,615,320,240")
+    if agent is None and weights is None:
+        agent = AGENT_OF_PHOTOGRAPHS
     config, agent = configured(None, {"scene.objects": objects, "scene.names": split_names(names),
                                       "perception.weights": weights}, None, agent)
     if look_at(photos, config, agent=agent, intrinsics_px=given, json_file=json_file, out=out, console=wide(Console())):

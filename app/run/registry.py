@@ -54,7 +54,7 @@ class Agent:
     knows: str = "RGB, camera pose"
 
 
-DEFAULT_AGENT, AGENT_OF_OWN_SETS = "sceneccn", "open"
+DEFAULT_AGENT, AGENT_OF_OWN_SETS, AGENT_OF_PHOTOGRAPHS = "sceneccn", "open", "open"
 ALL_THREE = ("perception", "belief", "planner")
 AGENTS = {
     "sceneccn": Agent(ALL_THREE),
