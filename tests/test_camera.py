@@ -17,6 +17,7 @@ from saccade.shared.config import Config
 from saccade.shared.world.geometry import INTRINSICS_PX, project
 from saccade.shared.world.goal_image import read_goal_image
 from saccade.shared.world.task import start_pose
+from saccade.tests.fakes.bags import frames_of
 from saccade.tests.fakes.camera import HERE, THERE, centroid, complaint, dots, folder_of, line, tum, written
 
 
@@ -26,13 +27,6 @@ def camera_of(source, **values):
                                       {f"scene.{key}": value for key, value in scene.items()}))
 
 
-def all_frames(camera):
-    frames = [camera.begin("r", 0)[1].message]
-    while outputs := camera.next_frame():
-        frames.append(outputs[0].message)
-    return frames
-
-
 def test_an_episode_begins_with_goal_and_frame_and_ends_with_the_source(tmp_path):
     folder_of(tmp_path / "f", ["a.png", "b.png", "c.png"])
     camera = camera_of(str(tmp_path / "f"), rate_hz=4.0)
@@ -40,7 +34,7 @@ def test_an_episode_begins_with_goal_and_frame_and_ends_with_the_source(tmp_path
     assert [output.topic for output in outputs] == [topic for topic in reversed(SERVICE.outputs)]
     assert outputs[0].message.rgb is None
     assert (camera.episodes, camera.period_s) == (1, 0.25)
-    frames = all_frames(camera)
+    frames = frames_of(camera)
     assert [(f.run, f.episode, f.step, int(f.rgb[0, 0, 0])) for f in frames] == [("r", 0, k, k) for k in range(3)]
     assert camera.next_frame() == []
     again = [output.message for output in camera.begin("r", 1)]  # started again
@@ -69,7 +63,7 @@ def test_images_without_a_pose_are_skipped_and_counted(tmp_path):
     folder_of(tmp_path / "f", [f"{k}.png" for k in range(5)])
     poses = written(tmp_path / "p.jsonl", line(HERE, image="1.png"), line(THERE, image="3.png"))
     camera = camera_of(str(tmp_path / "f"), poses=poses)
-    frames = all_frames(camera)
+    frames = frames_of(camera)
     assert [(f.step, int(f.rgb[0, 0, 0])) for f in frames] == [(0, 1), (1, 3)]
     np.testing.assert_allclose(frames[1].world_from_camera, THERE, atol=1e-12)
     assert camera.skipped == 3
@@ -78,7 +72,7 @@ def test_images_without_a_pose_are_skipped_and_counted(tmp_path):
 def test_the_convention_of_poses_is_configured(tmp_path):
     folder_of(tmp_path / "f", ["a.png"])
     poses = written(tmp_path / "p.jsonl", line(HERE @ np.diag([1.0, -1.0, -1.0, 1.0])))
-    frame, = all_frames(camera_of(str(tmp_path / "f"), poses=poses, pose_convention="opencv"))
+    frame, = frames_of(camera_of(str(tmp_path / "f"), poses=poses, pose_convention="opencv"))
     np.testing.assert_allclose(frame.world_from_camera, HERE, atol=1e-12)
 
 
@@ -112,7 +106,7 @@ def test_an_endless_source_ends_with_its_poses(tmp_path):
 
     poses = read_poses(written(tmp_path / "p.txt", tum(0.0, HERE), tum(0.32, HERE)))
     camera = Camera(Endless(), poses, VirtualCamera((480, 480)))
-    assert len(all_frames(camera)) == 5  # at the last pose for a tenth of a second more
+    assert len(frames_of(camera)) == 5  # at the last pose for a tenth of a second more
 
 
 def test_what_is_assumed_is_said_and_what_is_known_is_not(tmp_path):
@@ -132,7 +126,7 @@ def test_frames_are_resampled_by_the_intrinsics_given(tmp_path):
     drawn, _ = project(np.zeros(3), HERE, (400.0, 400.0, 320.0, 240.0))
     Image.fromarray(dots([drawn], (640, 480))).save(tmp_path / "f" / "a.png")
     poses = written(tmp_path / "p.jsonl", line())
-    frame, = all_frames(camera_of(str(tmp_path / "f"), poses=poses, intrinsics_px=[400, 400, 320, 240]))
+    frame, = frames_of(camera_of(str(tmp_path / "f"), poses=poses, intrinsics_px=[400, 400, 320, 240]))
     expected, _ = project(np.zeros(3), frame.world_from_camera, frame.intrinsics_px)
     np.testing.assert_allclose(centroid(frame.rgb, expected), expected, atol=0.1)
 

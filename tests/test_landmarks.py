@@ -10,8 +10,9 @@ import torch
 
 from saccade.services.perception.comparer import Compared
 from saccade.services.perception.landmark_fit import FEATURES, FEWEST, LandmarkFit
+from saccade.services.perception.likeness import SURE
 from saccade.services.perception.local_features import LocalFeatures
-from saccade.services.perception.open_world import SURE, Match, Placed, Things, rolled
+from saccade.services.perception.open_world import Match, Placed, Things, rolled
 from saccade.shared.errors import SaccadeError
 from saccade.shared.model.bank import Bank
 from saccade.shared.model.landmarks import landmarks_of, packed

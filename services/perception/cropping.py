@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 import torch.nn.functional as F
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from saccade.shared.world.geometry import pixel_rays
@@ -31,11 +31,7 @@ class Cropper:
 
     def cut(self, window: Window) -> tuple[Tensor, Tensor]:
         """Crops [K, 3, 64, 64] and their masks [K, 1, 64, 64]. Outside the image the crop is black and the mask 0."""
-        pixels = window.pixels_of(_FINE_PX, self.intrinsics_px, self.up)
-        grid = torch.as_tensor(pixels / self.size * 2 - 1, dtype=torch.float32)
-        fx = self.intrinsics_px[0]
-        texels = np.maximum(2 * window.half_tangent * fx / _FINE_PX, 1e-6)
-        levels = np.clip(np.round(np.log2(texels)), 0, _LEVELS - 1).astype(int)
+        grid, levels = self._sampled(window, _FINE_PX)
         crops = torch.empty(len(grid), 3, CROP_PX, CROP_PX)
         for level in np.unique(levels):
             rows = torch.as_tensor(np.flatnonzero(levels == level))
@@ -46,13 +42,18 @@ class Cropper:
 
     def fine(self, window: Window, side_px: int) -> Tensor:
         """Larger crops [K, 3, S, S] of S = `side_px`. Outside the image the border goes on."""
-        grid = torch.as_tensor(window.pixels_of(side_px, self.intrinsics_px, self.up) / self.size * 2 - 1,
-                               dtype=torch.float32)
-        texels = 2 * window.half_tangent * self.intrinsics_px[0] / side_px
-        levels = np.clip(np.round(np.log2(np.maximum(texels, 1e-6))), 0, _LEVELS - 1).astype(int)
+        grid, levels = self._sampled(window, side_px)
         crops = [F.grid_sample(self.pyramid[level], each[None], mode="bicubic", padding_mode="border",
                                align_corners=False) for level, each in zip(levels, grid, strict=True)]
         return torch.cat(crops).clamp(0.0, 1.0)
+
+    def _sampled(self, window: Window, side_px: int) -> tuple[Tensor, NDArray[np.int64]]:
+        """Where side_px x side_px samples of the crops lie in the image [K, side_px, side_px, 2], from -1 to 1, and the
+        levels [K] of the pyramid that have about as many pixels."""
+        pixels = window.pixels_of(side_px, self.intrinsics_px, self.up)
+        grid = torch.as_tensor(pixels / self.size * 2 - 1, dtype=torch.float32)
+        texels = np.maximum(2 * window.half_tangent * self.intrinsics_px[0] / side_px, 1e-6)
+        return grid, np.clip(np.round(np.log2(texels)), 0, _LEVELS - 1).astype(int)
 
     def corrected(self, window: Window, correction: ArrayLike) -> Window:
         """The windows, changed by corrections [K, 3]: shift (du, dv) in crop sides and log of the scale's ratio."""

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import torch
 
 from saccade.services.perception.landmark_fit import FEATURES, LandmarkFit
+from saccade.services.perception.likeness import SURE
 from saccade.services.perception.local_features import Features, LocalFeatures
 from saccade.services.perception.things import FINE_PX, Things, rolled
 
@@ -35,7 +36,7 @@ class LandmarkSearch:
         self.features, self.fits = features, fits
 
     def __call__(self, things: Things, rolls: Sequence[float]) -> dict[int, Found]:
-        """What was found, by the number of the thing."""
+        """What was found for sure, by the number of the thing."""
         best: dict[int, Found] = {}
         for roll in rolls:
             angle = torch.full((len(things.fine),), roll)
@@ -46,7 +47,7 @@ class LandmarkSearch:
                     fit = self.fits[k](seen, focal, FINE_PX)
                     if fit is not None and (thing not in best or fit.inliers > best[thing].inliers):
                         best[thing] = Found(k, fit.inliers, roll)
-        return best
+        return {thing: found for thing, found in best.items() if found.inliers >= SURE}
 
     def _elected(self, seen: Features) -> list[int]:
         """The objects of which most landmarks may be seen from one side."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import astuple, dataclass
 
 import torch
 from torch import Tensor
@@ -25,8 +26,14 @@ class LogOdds:
     none: float = 2.0
 
     def __call__(self, similar: Tensor, same: Tensor, found: Tensor, usual: Tensor) -> Tensor:
-        return self.similar * similar + self.compared * same + self.landmarks * sure_of(found) \
-            - self.usual * torch.log1p(usual) - self.none
+        return log_odds(astuple(self), similar, same, found, usual)
+
+
+def log_odds(factors: Iterable[float] | Tensor, similar: Tensor, same: Tensor, found: Tensor, usual: Tensor) -> Tensor:
+    """The log odds by factors in the order of `LogOdds`."""
+    by_similar, by_compared, by_landmarks, by_usual, none = factors
+    return by_similar * similar + by_compared * same + by_landmarks * sure_of(found) \
+        - by_usual * torch.log1p(usual) - none
 
 
 def sure_of(found: Tensor) -> Tensor:

@@ -20,7 +20,7 @@ from saccade.services.perception.comparer import Compared, Comparison
 from saccade.services.perception.cropping import Cropper
 from saccade.services.perception.landmark_fit import FEATURES, Fit, LandmarkFit
 from saccade.services.perception.landmark_search import Found, LandmarkSearch
-from saccade.services.perception.likeness import COHORT, SURE, USUAL, Cohort, LogOdds
+from saccade.services.perception.likeness import COHORT, USUAL, Cohort, LogOdds
 from saccade.services.perception.local_features import LocalFeatures
 from saccade.services.perception.placed import Placed
 from saccade.services.perception.proposer import Proposals, Proposer, half_tangent, propose
@@ -126,13 +126,13 @@ class OpenWorld:
         found = found or {}
         crops, fine, roll = things.crops.clone(), things.fine.clone(), things.roll.copy()
         for thing, each in found.items():
-            if each.roll and each.inliers >= SURE:
+            if each.roll:
                 angle = torch.tensor([each.roll], dtype=torch.float32)
                 crops[thing], fine[thing] = rolled(crops[thing, None], angle)[0], rolled(fine[thing, None], angle)[0]
                 roll[thing] = each.roll
         similar = self._similar(crops)
         best = torch.stack([each.max(1).values for each in similar], 1).max(1).values
-        is_found = torch.tensor([thing in found and found[thing].inliers >= SURE for thing in range(len(crops))])
+        is_found = torch.tensor([thing in found for thing in range(len(crops))])
         lying = torch.nonzero((best < LIKE_SOMETHING) & ~is_found)[:, 0]
         if len(lying):
             angles = torch.tensor(ROLLS_RAD[1:], dtype=torch.float32)
@@ -178,7 +178,7 @@ class OpenWorld:
         directions = self.banks[k].directions
         likest = similar.max(1).values.topk(min(CANDIDATES, len(similar))).indices.tolist()
         pairs = []
-        for thing in sorted({*likest, *(n for n, each in found.items() if each.object == k and each.inliers >= SURE)}):
+        for thing in sorted({*likest, *(n for n, each in found.items() if each.object == k)}):
             left = similar[thing].clone()
             for _ in range(CANDIDATES):
                 view = int(left.argmax())

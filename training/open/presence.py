@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import numpy as np
 import torch
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from saccade.services.perception.comparer import Compared
-from saccade.services.perception.likeness import LogOdds, sure_of
+from saccade.services.perception.likeness import LogOdds, log_odds
 from saccade.services.perception.open_world import OpenWorld
 from saccade.shared.model.bank import FILLED, Bank
 from saccade.shared.world.geometry import IMAGE_SIZE_PX, INTRINSICS_PX
@@ -96,15 +96,13 @@ def fitted(evidence: Sequence[Evidence]) -> LogOdds:
     similar, same, found, usual, beside = (torch.stack([getattr(each, name) for each in evidence]).double()
                                            for name in ("similar", "same", "found", "usual", "beside"))
     shown = torch.tensor([each.shown for each in evidence])
-    start = LogOdds()
-    free = torch.tensor([start.similar, start.compared, start.landmarks, start.usual, start.none],
-                        dtype=torch.float64, requires_grad=True)
+    free = torch.tensor(astuple(LogOdds()), dtype=torch.float64, requires_grad=True)
     first = free.detach().clone()
     optimizer = torch.optim.LBFGS([free], max_iter=200, line_search_fn="strong_wolfe")
 
     def loss() -> Tensor:
         optimizer.zero_grad()
-        mine = free[0] * similar + free[1] * same + free[2] * sure_of(found) - free[3] * torch.log1p(usual) - free[4]
+        mine = log_odds(free, similar, same, found, usual)
         odds = torch.cat([mine.masked_fill(beside > 0, UNLIKELY), torch.zeros(len(mine), 1, dtype=torch.float64)], 1)
         right = odds.softmax(1)[torch.arange(len(shown)), shown]
         value = -((1 - MISTAKEN) * right + MISTAKEN / odds.shape[1]).log().mean()
