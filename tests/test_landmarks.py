@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from safetensors.numpy import load_file
 
 from saccade.services.perception.comparer import Compared
 from saccade.services.perception.landmark_fit import FEATURES, FEWEST, LandmarkFit
@@ -15,14 +16,15 @@ from saccade.services.perception.local_features import LocalFeatures
 from saccade.services.perception.open_world import Match, Placed, Things, rolled
 from saccade.shared.errors import SaccadeError
 from saccade.shared.model.bank import Bank
-from saccade.shared.model.landmarks import landmarks_of, packed
+from saccade.shared.model.landmarks import Landmarks, coded, landmarks_of
+from saccade.shared.model.weights import ObjectCard, write_weights
 from saccade.shared.render.objects import load_mesh
 from saccade.shared.render.world import World
 from saccade.shared.world.geometry import direction, look_at, rotation_angle
 from saccade.shared.world.windows import Window
-from saccade.training.open.landmarks import landmarks_from
+from saccade.training.open.landmarks import Places, landmarks_from, merged
 
-SIDE_PX, FOCAL_PX, RANGE_M = 192, 400.0, 0.6
+SIDE_PX, FOCAL_PX, RANGE_M = 256, 533.0, 0.6
 INTRINSICS = (FOCAL_PX, FOCAL_PX, SIDE_PX / 2, SIDE_PX / 2)
 
 
@@ -33,11 +35,11 @@ def features():
 
 @pytest.fixture(scope="module")
 def landmarks(features):
-    return landmarks_from(load_mesh("pantry", "cereal_box"), features, count=40)
+    return landmarks_from(load_mesh("pantry", "cereal_box"), features, count=100)
 
 
 def picture(name, towards, roll=None):
-    """An object of the pantry seen from a direction [3], by a camera whose picture has 192 px, and the camera."""
+    """An object of the pantry seen from a direction [3], by a camera whose picture has 256 px, and the camera."""
     world = World((load_mesh("pantry", name),), size_px=SIDE_PX,
                   intrinsics_px=INTRINSICS)
     world.place({name: (np.zeros(3), 0.0)})
@@ -72,8 +74,8 @@ def test_landmarks_of_one_object_do_not_fit_another(features, landmarks):
 
 
 def test_where_nothing_can_be_told_apart_nothing_fits(features, landmarks):
-    assert LandmarkFit(landmarks)(features(torch.full((1, 3, 192, 192), 0.5), FEATURES)[0], FOCAL_PX, SIDE_PX) is None
-    nothing = packed([(np.zeros((0, 3)), np.zeros((0, 64), dtype=np.float32))] * 3)
+    assert LandmarkFit(landmarks)(features(torch.full((1, 3, SIDE_PX, SIDE_PX), 0.5), FEATURES)[0], FOCAL_PX, SIDE_PX) is None
+    nothing = merged([Places(np.zeros((0, 3)), np.zeros((0, 64), dtype=np.float32), np.array([0, 0, 1.0]))] * 3, 0.01)
     found = features(picture("cereal_box", direction(0.3, 0.4))[0], FEATURES)[0]
     assert len(found.pixels) > FEWEST
     assert LandmarkFit(nothing)(found, FOCAL_PX, SIDE_PX) is None
@@ -97,16 +99,54 @@ def test_a_fit_in_a_rolled_crop_is_told_in_the_cameras_frame(features, landmarks
 
 
 @pytest.mark.parametrize("change", [
-    {"landmark_counts": np.array([], dtype=np.uint8)}, {"landmark_points_m": np.zeros((5, 3), dtype=np.float16)},
-    {"landmarks_usual": np.array([np.nan], dtype=np.float32)}, {"landmark_descriptors": np.zeros((5, 64))}])
+    {"landmark_points_m": np.zeros((5, 2), dtype=np.float16)},
+    {"landmark_points_m": np.zeros((5, 3), dtype=np.float16)},
+    {"landmarks_usual": np.array([np.nan], dtype=np.float32)}, {"landmark_codes": np.zeros((5, 32))},
+    {"landmark_seen": np.zeros((2, 5), dtype=np.uint8)},
+    {name: np.zeros((10 ** 6, columns), dtype=np.uint8) for name, columns in (("landmark_points_m", 3),
+                                                                             ("landmark_codes", 32))}])
 def test_damaged_landmarks_are_refused(landmarks, change):
     arrays = landmarks.arrays()
     again = landmarks_of(arrays)
     assert again.points_m == pytest.approx(landmarks.points_m, abs=1e-3)
-    assert (again.descriptors == landmarks.descriptors).all()
+    assert (again.codes == landmarks.codes).all()
+    assert (again.seen == landmarks.seen).all()
     assert again.usual == pytest.approx(landmarks.usual)
     with pytest.raises(ValueError, match="its landmarks"):
         landmarks_of(arrays | change)
+
+
+def test_descriptors_are_kept_in_half_a_byte_each():
+    vectors = torch.nn.functional.normalize(torch.randn(50, 64, generator=torch.Generator().manual_seed(1))).numpy()
+    kept = Landmarks(np.zeros((50, 3), dtype=np.float32), coded(vectors), np.ones((60, 50), dtype=bool))
+    assert landmarks_of(kept.arrays()).descriptors == pytest.approx(kept.descriptors)
+    assert (vectors * kept.descriptors).sum(1).min() > 0.98
+    assert sum(array.nbytes for array in kept.arrays().values()) < 50 * 48
+
+
+def test_a_file_of_a_bank_holds_its_landmarks_as_they_are(tmp_path, landmarks):
+    """Also where an array does not lie in memory row by row."""
+    there = ObjectCard("box", (0.1, 0.1, 0.1), 0.2)
+    write_weights(tmp_path, {}, (there,), {}, {"box": landmarks.arrays()})
+    again = landmarks_of(load_file(tmp_path / "box.bank.safetensors"))
+    assert (again.seen == landmarks.seen).all()
+    assert (again.codes == landmarks.codes).all()
+
+
+def test_places_that_are_found_again_are_one_landmark():
+    """What lies together and looks alike is one; what was found too seldom is none; more often found ones come
+    first."""
+    mark = np.eye(64, dtype=np.float32)
+    places = [([0.0, 0.0, 0.0], 0), ([0.1, 0.0, 0.0], 1), ([0.1, 0.0, 0.0], 2), ([0.0, 0.0, 0.1], 3)]
+    towards = (np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0]))
+    views = [Places(np.array([point for point, _ in places]) + 0.001 * n, mark[[k for _, k in places]], towards[n % 2])
+             for n in range(3)]
+    views.append(Places(np.array([[0.1, 0.0, 0.001], [0.3, 0.3, 0.3]]), mark[[1, 4]], towards[0]))
+    told = merged(views, 0.005)
+    assert len(told.points_m) == 4
+    assert told.points_m[0] == pytest.approx([0.1, 0.0, 0.0], abs=0.002)
+    assert told.descriptors[0].argmax() == 1
+    assert told.seen[:, 0].sum() == 2
 
 
 def test_a_plain_object_has_few_usual_landmarks(features, landmarks):

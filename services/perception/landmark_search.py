@@ -10,22 +10,21 @@ from dataclasses import dataclass
 
 import torch
 
-from saccade.services.perception.landmark_fit import FEATURES, LandmarkFit
+from saccade.services.perception.landmark_fit import FEATURES, Fit, LandmarkFit
 from saccade.services.perception.likeness import SURE
-from saccade.services.perception.local_features import Features, LocalFeatures
+from saccade.services.perception.local_features import LocalFeatures
 from saccade.services.perception.things import FINE_PX, Things, rolled
 
-VOTERS = 250  # features of a crop that vote for an object
-ELECTED = 8  # objects whose landmarks are fitted to a crop
+ELECTED = 24  # pairs of a roll and an object whose landmarks are fitted to a thing
 
 
 @dataclass(frozen=True)
 class Found:
-    """The object whose landmarks fit a thing best: its number, how many fit, and the angle (rad) by which the crop was
+    """The object whose landmarks fit a thing best: its number, how they fit, and the angle (rad) by which the crop was
     rolled."""
 
     object: int
-    inliers: int
+    fit: Fit
     roll: float
 
 
@@ -37,21 +36,19 @@ class LandmarkSearch:
 
     def __call__(self, things: Things, rolls: Sequence[float]) -> dict[int, Found]:
         """What was found for sure, by the number of the thing."""
-        best: dict[int, Found] = {}
-        for roll in rolls:
-            angle = torch.full((len(things.fine),), roll)
-            fine = rolled(things.fine, angle) if roll else things.fine
-            for thing, seen in enumerate(self.features(fine, FEATURES)):
-                focal = FINE_PX / 2 / float(things.window.half_tangent[thing])
-                for k in self._elected(seen):
-                    fit = self.fits[k](seen, focal, FINE_PX)
-                    if fit is not None and (thing not in best or fit.inliers > best[thing].inliers):
-                        best[thing] = Found(k, fit.inliers, roll)
-        return {thing: found for thing, found in best.items() if found.inliers >= SURE}
+        best = {thing: self._best(things, thing, rolls) for thing in range(len(things.fine))}
+        return {thing: found for thing, found in best.items() if found is not None and found.fit.inliers >= SURE}
 
-    def _elected(self, seen: Features) -> list[int]:
-        """The objects of which most landmarks may be seen from one side."""
-        if len(self.fits) <= ELECTED:
-            return list(range(len(self.fits)))
-        votes = torch.tensor([fit.votes(seen, VOTERS) for fit in self.fits])
-        return votes.topk(ELECTED).indices.tolist()
+    def _best(self, things: Things, thing: int, rolls: Sequence[float]) -> Found | None:
+        """What fits a thing best. In which rolls which objects are fitted, is elected by votes."""
+        turned = rolled(things.fine[thing, None].expand(len(rolls), -1, -1, -1), torch.tensor(rolls))
+        seen = self.features(turned, FEATURES)
+        focal = FINE_PX / 2 / float(things.window.half_tangent[thing])
+        votes = torch.tensor([[fit.votes(each) for fit in self.fits] for each in seen]).flatten()
+        best: Found | None = None
+        for elected in votes.topk(min(ELECTED, len(votes))).indices.tolist():
+            roll, k = divmod(elected, len(self.fits))
+            fit = self.fits[k](seen[roll], focal, FINE_PX)
+            if fit is not None and (best is None or fit.inliers > best.fit.inliers):
+                best = Found(k, fit, rolls[roll])
+        return best

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 COHORT, LIKEST = "cohort", 50  # name of the cohort's file, and how many of its views count
-SURE, UNSURE = 20.0, 3.0  # landmarks
+OBJECTS = 5  # that are known where the log odds are fitted
+SURE, UNSURE = 16.0, 2.0  # landmarks
 UNIT = 0.05  # about the standard deviation of the largest similarities, so that normalised ones are as large as others
 
 

@@ -20,7 +20,7 @@ from saccade.services.perception.comparer import Compared, Comparison
 from saccade.services.perception.cropping import Cropper
 from saccade.services.perception.landmark_fit import FEATURES, Fit, LandmarkFit
 from saccade.services.perception.landmark_search import Found, LandmarkSearch
-from saccade.services.perception.likeness import COHORT, USUAL, Cohort, LogOdds
+from saccade.services.perception.likeness import COHORT, OBJECTS, USUAL, Cohort, LogOdds
 from saccade.services.perception.local_features import LocalFeatures
 from saccade.services.perception.placed import Placed
 from saccade.services.perception.proposer import Proposals, Proposer, half_tangent, propose
@@ -75,6 +75,7 @@ class OpenWorld:
         self.features, self.cohort = features, cohort
         self.fits = [LandmarkFit(bank.landmarks) for bank in banks]
         self.search = LandmarkSearch(features, self.fits)
+        self.many = float(np.log(max(len(banks) / OBJECTS, 1.0)))  # a thing is each of many more seldom
         self.likest = [cohort.likest(vectors) for vectors in self.vectors]
 
     @torch.inference_mode()
@@ -94,8 +95,8 @@ class OpenWorld:
         compared = Compared(self.comparison(things.crops[[thing for _, thing, _ in pairs]], known))
         masks = F.interpolate(things.masks[:, None], size=(MASK_PX, MASK_PX), mode="bilinear")[:, 0] > 0.5
         alike = torch.stack([similar[k][thing, view] for k, thing, view in pairs])
-        fits = self.fitted(things, {(k, thing) for k, thing, _ in pairs})
-        odds = self.log_odds(alike, compared.same, *self.found(pairs, fits)).double().numpy()
+        fits = self.fitted(things, {(k, thing) for k, thing, _ in pairs}, found)
+        odds = self.log_odds(alike, compared.same, *self.found(pairs, fits)).double().numpy() - self.many
         for k, match in enumerate(self._matches(pairs, odds, fits)):
             seen.presence[k] = match.presence
             placed = Placed(self.banks[k], match, compared, things, intrinsics_px, up)
@@ -150,14 +151,17 @@ class OpenWorld:
         return replace(things, crops=crops, fine=fine, roll=roll), similar
 
     @torch.inference_mode()
-    def fitted(self, things: Things, pairs: Collection[tuple[int, int]]) -> dict[tuple[int, int], Fit]:
-        """How the landmarks of objects fit things, for those of the `pairs` (object, thing) where enough do."""
-        wanted = sorted({thing for _, thing in pairs})
-        found = dict(zip(wanted, self.features(things.fine[wanted], FEATURES), strict=True))
-        fits = {}
-        for k, thing in sorted(pairs):
+    def fitted(self, things: Things, pairs: Collection[tuple[int, int]],
+               found: Mapping[int, Found] | None = None) -> dict[tuple[int, int], Fit]:
+        """How the landmarks of objects fit things, for those of the `pairs` (object, thing) where enough do. What was
+        `found` is not fitted again."""
+        fits = {(each.object, thing): each.fit for thing, each in (found or {}).items()}
+        left = sorted(set(pairs) - fits.keys())
+        wanted = sorted({thing for _, thing in left})
+        seen = dict(zip(wanted, self.features(things.fine[wanted], FEATURES) if wanted else [], strict=True))
+        for k, thing in left:
             half = float(things.window.half_tangent[thing])
-            fit = self.fits[k](found[thing], FINE_PX / 2 / half, FINE_PX)
+            fit = self.fits[k](seen[thing], FINE_PX / 2 / half, FINE_PX, quick=not self.thorough)
             if fit is not None:
                 fits[k, thing] = fit
         return fits

@@ -13,13 +13,13 @@ from saccade.services.perception.cropping import warp
 from saccade.services.perception.landmark_fit import Fit
 from saccade.shared.world.windows import Window
 
-FINE_PX = 192  # side of the crops in which local features are found
+FINE_PX = 256  # side of the crops in which local features are found
 
 
 @dataclass(frozen=True)
 class Things:
     """P things that were proposed: their crops with masks [P, 4, 64, 64] and the windows of these, finer crops without
-    masks [P, 3, 192, 192], and their masks in the image [P, h, w]. The crops are rolled by the angles `roll` [P]
+    masks [P, 3, 256, 256], and their masks in the image [P, h, w]. The crops are rolled by the angles `roll` [P]
     (rad)."""
 
     crops: Tensor

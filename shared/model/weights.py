@@ -231,7 +231,8 @@ def write_weights(folder: Path, states: Mapping[str, Mapping[str, ArrayLike]], c
     """
     files = {f"{stem}.safetensors": save({key: np.asarray(value).astype(np.float16, order="C")
                                           for key, value in state.items()}) for stem, state in states.items()}
-    files |= {bank_file(name): save(arrays) for name, arrays in (banks or {}).items()}
+    files |= {bank_file(name): save({key: np.ascontiguousarray(array) for key, array in arrays.items()})
+              for name, arrays in (banks or {}).items()}  # safetensors writes an array's memory as it lies
     hashes = {**(kept or {}), **{name: hashlib.sha256(data).hexdigest() for name, data in files.items()}}
     objects = {card.name: {"size_m": [round(float(x), 6) for x in card.size_m], "crop_side_m": card.crop_side_m}
                for card in cards}

@@ -3,26 +3,41 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from saccade.services.perception.landmark_fit import FEATURES, LandmarkFit
 from saccade.services.perception.local_features import LocalFeatures
-from saccade.shared.model.landmarks import PER_VIEW, VIEWS, Landmarks, packed
+from saccade.shared.model.landmarks import DESCRIPTOR, MOST, SIDES, Landmarks, coded
 from saccade.shared.render.mesh import Mesh
 from saccade.shared.render.world import World
 from saccade.shared.world.geometry import fibonacci_sphere, look_at, pixel_rays, unit
 
-SIDE_PX = 192  # of a view
+VIEWS = 160  # from all around, each as it is and as a small, noisy picture shows it
+SIDE_PX = 256  # of a view
+SMALL_PX, NOISE = 100, 0.01  # sides of a small picture, and its noise
+PER_VIEW = 250  # places in each view: the surest ones
+TOGETHER_PX, ALIKE = 2.0, 0.85  # places so near, with descriptors whose product is so large, are one landmark
+OFTEN = 3  # a landmark is found in so many pictures, or it is not kept
 RANGE = 4.0  # of the camera, in half diagonals of the object, between these ranges (m)
 NEAREST_M, FARTHEST_M = 0.2, 2.0
 FILLED = 0.92  # of the view: the ball around the object
 BORDER_PX = 2  # so far from the outline the depth is that of the surface
 BEHIND = 0.5  # grey
-TRIED, SMALL_PX, NOISE = 15, 80, 0.02  # pictures in which landmarks are looked for again, their sides, and their noise
+TRIED, TRIED_PX, TRIED_NOISE = 15, 80, 0.02  # pictures in which landmarks are looked for again, sides, and noise
+
+
+class Places(NamedTuple):
+    """Places [N, 3] (m, in the object's frame) with their descriptors [N, 64], seen by a camera in a direction [3]."""
+
+    points_m: NDArray[np.float64]
+    descriptors: NDArray[np.float32]
+    towards: NDArray[np.float64]
 
 
 def landmarks_from(mesh: Mesh, features: LocalFeatures, count: int = VIEWS) -> Landmarks:
@@ -35,8 +50,11 @@ def landmarks_from(mesh: Mesh, features: LocalFeatures, count: int = VIEWS) -> L
     intrinsics = (focal, focal, SIDE_PX / 2, SIDE_PX / 2)
     world.set_intrinsics(intrinsics)
     world.place({mesh.name: (np.zeros(3), 0.0)})
-    cameras = [look_at(range_m * towards, np.zeros(3)) for towards in fibonacci_sphere(count)]
-    landmarks = packed([_view(world, mesh.name, camera, intrinsics, features) for camera in cameras])
+    rng, views = np.random.default_rng(0), []
+    for towards in fibonacci_sphere(count):
+        camera = look_at(range_m * towards, np.zeros(3))
+        views += _views(world, mesh.name, camera, intrinsics, features, rng)
+    landmarks = merged(views, TOGETHER_PX * 2 * radius / (FILLED * SIDE_PX))
     usual = _found_again(world, LandmarkFit(landmarks), focal, range_m, features)
     world.close()
     return replace(landmarks, usual=usual)
@@ -48,28 +66,75 @@ def _found_again(world: World, fit: LandmarkFit, focal: float, range_m: float, f
     rng, counts = np.random.default_rng(0), []
     for towards in unit(rng.normal(size=(TRIED, 3))):
         image = torch.from_numpy(world.render(look_at(range_m * towards, np.zeros(3))).copy()).permute(2, 0, 1)[None]
-        small = F.interpolate(image.float() / 255.0, size=(SMALL_PX, SMALL_PX), mode="area")
-        noise = torch.from_numpy(rng.normal(scale=NOISE, size=small.shape)).float()
-        large = F.interpolate((small + noise).clamp(0, 1), size=(SIDE_PX, SIDE_PX), mode="bicubic")
-        fitted = fit(features(large.clamp(0, 1), FEATURES)[0], focal, SIDE_PX)
+        small = _small(image.float() / 255.0, TRIED_PX, TRIED_NOISE, rng)
+        fitted = fit(features(small, FEATURES)[0], focal, SIDE_PX)
         counts.append(0 if fitted is None else fitted.inliers)
     return float(np.median(counts))
 
 
-def _view(world: World, name: str, camera: NDArray[np.float64], intrinsics: tuple[float, ...],
-          features: LocalFeatures) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """The places [N, 3] (m, in the object's frame) and the descriptors [N, 64] of a view, the surest first."""
+def _small(image: torch.Tensor, side_px: int, noise: float, rng: np.random.Generator) -> torch.Tensor:
+    """An image [1, 3, H, H] as a small, noisy picture shows it, enlarged again."""
+    small = F.interpolate(image, size=(side_px, side_px), mode="area")
+    small = small + torch.from_numpy(rng.normal(scale=noise, size=small.shape)).float()
+    return F.interpolate(small.clamp(0, 1), size=image.shape[2:], mode="bicubic").clamp(0, 1)
+
+
+def _views(world: World, name: str, camera: NDArray[np.float64], intrinsics: tuple[float, ...],
+           features: LocalFeatures, rng: np.random.Generator) -> list[Places]:
+    """The places in a view as it is, and in a small picture of it, the surest first."""
     mask = world.render_masks(camera)[name]
     image = np.where(mask[..., None], world.render(camera) / 255.0, BEHIND).astype(np.float32)
-    depth = world.render_depth(camera)
-    found = features(torch.from_numpy(image).permute(2, 0, 1)[None], 4 * PER_VIEW)[0]
-    pixels = found.pixels.double().numpy()
-    inside = _inside(mask)[tuple(pixels.astype(int).T[::-1])]
-    pixels = pixels[inside]
-    rays = pixel_rays(pixels, intrinsics)
-    ranges = depth[tuple(pixels.astype(int).T[::-1])] / -rays[:, 2]
-    places = (rays * ranges[:, None]) @ camera[:3, :3].T + camera[:3, 3]
-    return places, found.descriptors.numpy()[inside]
+    depth, inside = world.render_depth(camera), _inside(mask)
+    sharp = torch.from_numpy(image).permute(2, 0, 1)[None]
+    views = []
+    for found in features(torch.cat([sharp, _small(sharp, SMALL_PX, NOISE, rng)]), 4 * PER_VIEW):
+        pixels = found.pixels.double().numpy()
+        kept = np.flatnonzero(inside[tuple(pixels.astype(int).T[::-1])])[:PER_VIEW]
+        pixels = pixels[kept]
+        rays = pixel_rays(pixels, intrinsics)
+        ranges = depth[tuple(pixels.astype(int).T[::-1])] / -rays[:, 2]
+        points = (rays * ranges[:, None]) @ camera[:3, :3].T + camera[:3, 3]
+        views.append(Places(points, found.descriptors.numpy()[kept], unit(camera[:3, 3])))
+    return views
+
+
+def merged(views: list[Places], together_m: float) -> Landmarks:
+    """The landmarks that are found in several views, each in the middle of its places, with its mean descriptor."""
+    points, descriptors = np.concatenate([v.points_m for v in views]), np.concatenate([v.descriptors for v in views])
+    of = _groups(points, descriptors, together_m)
+    counts = np.bincount(of)
+    middle = np.stack([np.bincount(of, column) for column in points.T], 1) / np.maximum(counts, 1)[:, None]
+    mean = np.zeros((len(counts), DESCRIPTOR), dtype=np.float32)
+    np.add.at(mean, of, descriptors)
+    side = np.repeat([_side(view.towards) for view in views], [len(view.points_m) for view in views])
+    seen = np.zeros((SIDES, len(counts)), dtype=bool)
+    seen[side, of] = True
+    kept = np.argsort(-counts, kind="stable")[:MOST]
+    kept = kept[counts[kept] >= OFTEN]
+    return Landmarks(middle[kept].astype(np.float32), coded(unit(mean[kept]).astype(np.float32)), seen[:, kept])
+
+
+def _groups(points_m: NDArray[np.float64], descriptors: NDArray[np.float32], together_m: float) -> NDArray[np.intp]:
+    """To which landmark each of N places belongs [N]. Those with the most alike ones around them come first."""
+    pairs = cKDTree(points_m).query_pairs(together_m, output_type="ndarray") if len(points_m) else np.zeros((0, 2), int)
+    pairs = pairs[(descriptors[pairs[:, 0]] * descriptors[pairs[:, 1]]).sum(1) > ALIKE]
+    both = np.concatenate([pairs, pairs[:, ::-1]])
+    both = both[np.argsort(both[:, 0], kind="stable")]
+    counts = np.bincount(both[:, 0], minlength=len(points_m))
+    neighbours = np.split(both[:, 1], np.cumsum(counts)[:-1])
+    of, groups = np.full(len(points_m), -1), 0
+    for place in np.argsort(-counts, kind="stable"):
+        if of[place] < 0:
+            near = neighbours[place]
+            of[near[of[near] < 0]] = groups
+            of[place] = groups
+            groups += 1
+    return of
+
+
+def _side(towards: NDArray[np.float64]) -> int:
+    """The number of the side that a direction [3] is nearest to."""
+    return int((fibonacci_sphere(SIDES) @ towards).argmax())
 
 
 def _inside(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from saccade.services.perception.comparer import Compared
-from saccade.services.perception.likeness import LogOdds, log_odds
+from saccade.services.perception.likeness import OBJECTS, LogOdds, log_odds
 from saccade.services.perception.open_world import OpenWorld
 from saccade.shared.model.bank import FILLED, Bank
 from saccade.shared.world.geometry import IMAGE_SIZE_PX, INTRINSICS_PX
@@ -19,7 +19,6 @@ from saccade.training.open.proposer import circles_px
 from saccade.training.open.table_crops import Sights
 from saccade.training.open.tables import Tables
 
-OBJECTS = 5  # in a set that is drawn for a table; all other things there are strangers
 NEAR, FAR = 0.4, 1.0  # of a circle's radius: a proposal within the first shows it, one between them is not counted
 UP = (0.0, 1.0, 0.0)
 RIDGE, MISTAKEN, UNLIKELY = 0.1, 0.01, -30.0
@@ -54,7 +53,7 @@ def fit_presence(model: OpenWorld, banks: Mapping[int, Bank], tables: Tables, si
 
 
 def _drawn(known: NDArray[np.int64], there: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.int64]:
-    """A set of objects, in which about half of those that are there are."""
+    """A set of objects, in which about half of those that are there are. All other things there are strangers."""
     mine = rng.permutation(there)[:max(1, min(len(there) // 2, OBJECTS - 1))]
     others = rng.permutation(known[~np.isin(known, there)])
     return np.concatenate([mine, others])[:OBJECTS]
