@@ -74,7 +74,8 @@ def test_landmarks_of_one_object_do_not_fit_another(features, landmarks):
 
 
 def test_where_nothing_can_be_told_apart_nothing_fits(features, landmarks):
-    assert LandmarkFit(landmarks)(features(torch.full((1, 3, SIDE_PX, SIDE_PX), 0.5), FEATURES)[0], FOCAL_PX, SIDE_PX) is None
+    plain = torch.full((1, 3, SIDE_PX, SIDE_PX), 0.5)
+    assert LandmarkFit(landmarks)(features(plain, FEATURES)[0], FOCAL_PX, SIDE_PX) is None
     nothing = merged([Places(np.zeros((0, 3)), np.zeros((0, 64), dtype=np.float32), np.array([0, 0, 1.0]))] * 3, 0.01)
     found = features(picture("cereal_box", direction(0.3, 0.4))[0], FEATURES)[0]
     assert len(found.pixels) > FEWEST
