@@ -61,7 +61,8 @@ def test_all_start_the_same_processes(compose, kubernetes):
 def test_whoever_reads_objects_or_what_is_learnt_of_them_has_the_users_own_sets(compose):
     readers = {"director", "simulator", "perception", "belief", "planner", "evaluator", "recorder", "viewer", "replay"}
     for name in readers:
-        sets, = (volume for volume in compose[name]["volumes"] if isinstance(volume, dict) and volume["target"] == "/sets")
+        sets, = (volume for volume in compose[name]["volumes"]
+                 if isinstance(volume, dict) and volume["target"] == "/sets")
         assert compose[name]["environment"]["SACCADE_OBJECTS"] == "/sets"
         assert sets["read_only"]
         assert sets["source"] == "${SACCADE_SETS:-${XDG_DATA_HOME:-${HOME:-.}/.local/share}/saccade/objects}"

@@ -55,8 +55,8 @@ def add(meshes: Annotated[list[Path] | None, typer.Argument(
     ask = None if yes else _ask
     if views is not None:
         if meshes or unit != "auto":
-            raise SaccadeError("--views takes the place of a mesh: leave the meshes and --unit out; --scale is the unit "
-                               "of the poses")
+            raise SaccadeError("--views takes the place of a mesh: leave the meshes and --unit out; --scale is the "
+                               "unit of the poses")
         add_views(views, objects, name=name, told=_told(poses, intrinsics, scale, None if up == "auto" else up),
                   masks=masks, ask=ask, console=Console(), symmetry=known)
         return

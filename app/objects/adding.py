@@ -68,8 +68,9 @@ def add_meshes(paths: Sequence[Path], objects: str, *, name: str | None, unit: L
 
 def add_views(source: Path, objects: str, *, name: str | None, told: Told, masks: Path | None, ask: Ask | None,
               console: Console, symmetry: int | None = None) -> None:
-    """Adds an object to a set of the user's from pictures around it, and learns it. `source` is their folder or a video,
-    `told` what is known of the camera, and `masks` a folder with a mask for each picture; see `add_meshes` for the rest.
+    """Adds an object to a set of the user's from pictures around it, and learns it. `source` is their folder or a
+    video, `told` what is known of the camera, and `masks` a folder with a mask for each picture; for the rest see
+    `add_meshes`.
 
     Raises SaccadeError if nothing can be made of the pictures; then nothing is kept.
     """

@@ -117,8 +117,8 @@ class Folder:
 
 
 def image_paths(folder: Path) -> list[Path]:
-    """The PNG and JPEG files of a folder, without hidden files, sorted by name. Raises SaccadeError if there are none or
-    too many, or if the folder cannot be read."""
+    """The PNG and JPEG files of a folder, without hidden files, sorted by name. Raises SaccadeError if there are none
+    or too many, or if the folder cannot be read."""
     paths = sorted(_images_in(folder), key=_natural)
     if not paths:
         raise SaccadeError(f"folder {folder} holds no image: put PNG or JPEG files into it")

@@ -63,7 +63,8 @@ def read_mesh(path: Path, name: str, *, unit: Literal["m", "cm", "mm", "auto"] =
         parts = _without_flat(thinned(parts), path)
         remain = sum(len(part.corners) for part in parts)
         notes.append(f"The mesh was simplified from {len(corners)} to {remain} faces, so that it is rendered fast.")
-    return Imported(joined_mesh(parts, name, METRES[chosen], axis, path), tuple(dict.fromkeys(notes)), chosen, axis, files)
+    mesh = joined_mesh(parts, name, METRES[chosen], axis, path)
+    return Imported(mesh, tuple(dict.fromkeys(notes)), chosen, axis, files)
 
 
 def _files(path: Path) -> tuple[Path, ...]:

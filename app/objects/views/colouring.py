@@ -107,7 +107,8 @@ def _hidden(parts: list[Part], corners: Array) -> Part:
     """Faces [F, 3, 3] that no picture shows, in the colours of those nearest to them."""
     places, colours = [], []
     for part in parts:
-        assert part.uv is not None and part.image is not None  # as `_part` makes them
+        if part.uv is None or part.image is None:  # not one that `_part` makes
+            continue
         image = np.asarray(part.image)
         at = part.uv.mean(1) * (1, -1) + (0, 1)
         columns, rows = np.clip((at * image.shape[1::-1]).astype(int), 0, np.array(image.shape[1::-1]) - 1).T

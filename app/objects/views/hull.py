@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, map_coordinates
 
-from saccade.app.objects.views.heights import Grid, cut_in_height
+from saccade.app.objects.views.cutting import Grid, cut
 from saccade.app.objects.views.view import View
 from saccade.shared.errors import SaccadeError
 from saccade.shared.render.mesh_thin import MANY_FACES, simplified
@@ -53,14 +53,14 @@ def hull_of(views: list[View]) -> Hull:
     there = coarse.points_m[(coarse.inside_m > -coarse.pitch_m).ravel()]
     low, high = there.min(0) - coarse.pitch_m, there.max(0) + coarse.pitch_m
     fine = _carved(_empty(low, high - low, FINE), views, distances)
-    cut = cut_in_height(fine, views, center)
-    if cut.inside_m.max() <= 0:
+    least = cut(fine, views)
+    if least.inside_m.max() <= 0:
         raise SaccadeError("nothing is left of the object where all outlines meet: is it thinner than a hundredth of "
                            "its length, or do the poses not fit the pictures?")
-    padded = np.pad(cut.inside_m, 1, constant_values=-cut.pitch_m)
+    padded = np.pad(least.inside_m, 1, constant_values=-least.pitch_m)
     points, faces, *_ = marching_cubes(padded, 0.0, gradient_direction="ascent")
     points, faces, _ = simplified(points.astype(np.float64), faces.astype(np.int64), MANY_FACES)
-    return Hull(cut.low_m + cut.pitch_m * (points - 1), faces, views)
+    return Hull(least.low_m + least.pitch_m * (points - 1), faces, views)
 
 
 def _distances(mask: NDArray[np.bool_]) -> NDArray[np.float32]:

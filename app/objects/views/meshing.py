@@ -84,6 +84,6 @@ def _unseen(elevations_rad: Array) -> list[str]:
     if elevations_rad.max() < ABOVE_RAD:
         lines.append("Its top was not seen: it is taken to be flat. Film it from above too.")
     if elevations_rad.min() > LOW_RAD:
-        lines.append("It was seen from high above only: if it is round at its top, its height is too small. Film it from "
-                     "its own height too.")
+        lines.append("It was seen from high above only: if it is round at its top, its height is too small. Film it "
+                     "from its own height too.")
     return lines

@@ -34,8 +34,8 @@ NEED = "give whole PNG or JPEG files of 8 bits"
 @dataclass(frozen=True)
 class Picture:
     """rgb [H, W, 3] uint8 of a pinhole camera with `intrinsics_px` at world_from_camera [4, 4] (OpenGL). `mask` [H, W]
-    says what belongs to the object, if the file has an alpha channel. `places` [2, H, W] are the rows and columns of the
-    pixels before the distortion of the lens was removed, None if it had none."""
+    says what belongs to the object, if the file has an alpha channel. `places` [2, H, W] are the rows and columns of
+    the pixels before the distortion of the lens was removed, None if it had none."""
 
     name: str
     rgb: NDArray[np.uint8]
@@ -51,13 +51,13 @@ class Told:
 
     poses: Path
     intrinsics_px: Intrinsics | None = None
-    asked: Asked = Asked()
+    asked: Asked = field(default_factory=Asked)
     notes: list[str] = field(default_factory=list)
 
 
 def pictures_of(source: Path, told: Told) -> Iterator[Picture]:
-    """Yields pictures that have a pose, evenly spread over all: at most MOST of a folder, and of a video more than that,
-    because its length is not known before. Raises SaccadeError if the pictures or the poses cannot be read, if no
+    """Yields pictures that have a pose, evenly spread over all: at most MOST of a folder, and of a video more than
+    that, because its length is not known before. Raises SaccadeError if the pictures or the poses cannot be read, if no
     picture has a pose, or if nothing tells the intrinsics."""
     if is_live(str(source)):
         raise SaccadeError(f"--views {source}: give a folder of pictures or a video; a camera cannot be asked twice")
@@ -129,8 +129,8 @@ def evenly(count: int, most: int) -> list[int]:
 
 
 def read_picture(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None, Size, float | None]:
-    """A picture's colours [H, W, 3], made smaller and upright, the mask of its alpha channel if it has one, its own size
-    (width, height), and its focal length in pixels if its EXIF data tell it."""
+    """A picture's colours [H, W, 3], made smaller and upright, the mask of its alpha channel if it has one, its own
+    size (width, height), and its focal length in pixels if its EXIF data tell it."""
     with opened_image(path, "picture", NEED) as image:
         if image.mode not in MODES:
             raise SaccadeError(f"picture {path} has mode {image.mode}: {NEED}")

@@ -25,7 +25,8 @@ NOT_PLAIN, EMPTY, CUT_OFF, NO_MASK = "not plain", "empty", "cut off", "no mask"
 _SAID = {
     NOT_PLAIN: "the background is not plain: put the object before and on something of one colour that it does not "
                "have, in even light, or give --masks FOLDER",
-    EMPTY: "nothing is seen of the object: see that it differs from the background, and that a mask is white where it is",
+    EMPTY: "nothing is seen of the object: see that it differs from the background, and that masks are white where it "
+           "is",
     CUT_OFF: "the picture's border cuts something off: keep the whole object in the picture, and nothing else but the "
              "background",
     NO_MASK: "there is no mask of the picture's name in the folder of --masks"}
