@@ -17,7 +17,7 @@ from saccade.app.objects.views.view import View
 from saccade.shared.world.geometry import Array, direction, fibonacci_sphere, pixel_rays, unit
 
 SMOOTH = 0.7  # of the distances, in points of the grid
-LEVEL, OTHERS = 240, 300  # directions of the planes: around the vertical, in which most objects have flat sides, and all
+LEVEL, OTHERS = 240, 300  # directions of the planes: level, in which most objects have flat sides, and all around
 ACROSS = np.cos(np.radians(65))  # views that look more along a direction do not tell where the object ends in it
 RING = (1.0, 2.2)  # within the outline are the pixels whose rays are followed, in points of the grid
 RAYS = 400  # of a view
@@ -35,7 +35,7 @@ class Grid:
     @property
     def points_m(self) -> Array:
         """The points [X * Y * Z, 3]."""
-        return self.low_m + self.pitch_m * np.stack(np.indices(self.inside_m.shape), -1).reshape(-1, 3)
+        return self.low_m + self.pitch_m * np.moveaxis(np.indices(self.inside_m.shape), 0, -1).reshape(-1, 3)
 
 
 def cut(grid: Grid, views: list[View]) -> Grid:
@@ -57,8 +57,8 @@ def cut(grid: Grid, views: list[View]) -> Grid:
 
 
 def _ends(grid: Grid, view: View, planes: Array) -> Array:
-    """How far the hull must reach in the directions of planes [P, 3] so that the outline of a view stays covered [P], in
-    metres from the world's origin. It is -inf where the view does not tell it.
+    """How far the hull must reach in the directions of planes [P, 3] so that the outline of a view stays covered [P],
+    in metres from the world's origin. It is -inf where the view does not tell it.
 
     The ray of a pixel within the outline enters the hull and leaves it, and one of these two places must remain.
     """
