@@ -12,7 +12,7 @@ from rich.console import Console
 
 from saccade.app.cli.main import main
 from saccade.app.objects.adding import add_views
-from saccade.app.objects.views import pictures
+from saccade.app.objects.views import cutting, hull, pictures
 from saccade.app.objects.views.masks import plain_mask
 from saccade.app.objects.views.meshing import mesh_from_views
 from saccade.app.objects.views.pictures import Told, evenly, pictures_of
@@ -21,8 +21,8 @@ from saccade.services.camera.trajectories.lens import Lens
 from saccade.services.camera.trajectories.trajectory import Asked
 from saccade.shared.errors import SaccadeError
 from saccade.shared.model.object_card import read_card
-from saccade.shared.model.weights import OPEN, Weights
 from saccade.shared.render.groceries import grocery
+from saccade.shared.render.objects import load_mesh
 from saccade.shared.render.world import World
 from saccade.shared.world.geometry import direction, look_at, pixel_rays, project
 
@@ -85,6 +85,14 @@ def home(tmp_path, monkeypatch):
     return tmp_path / "sets"
 
 
+@pytest.fixture
+def coarse(monkeypatch):
+    """A coarse shape, where the test is not about it."""
+    monkeypatch.setattr(hull, "FINE", 40)
+    monkeypatch.setattr(cutting, "LEVEL", 40)
+    monkeypatch.setattr(cutting, "OTHERS", 40)
+
+
 def made(folder, masks=None, **asked):
     return mesh_from_views(folder, "tea", Told(folder, asked=Asked(**asked)), masks)
 
@@ -99,16 +107,16 @@ def drawn(shown, azimuth):
 
 
 def test_a_mesh_from_views_has_the_size_the_stand_and_the_look_of_the_object(taken):
-    """The pictures are from three heights, none from below. The errors of the size stay below 4 mm, and from each side
-    the two look more alike than the object from two sides."""
+    """The pictures are from three heights, none from below, and a pixel is 1.4 mm. The errors of the size stay below
+    5 mm, and from each side the two look much more alike than the object from two sides."""
     found, true = made(taken), mesh()
     assert found.views == len(cameras())
-    assert found.mesh.size_m == pytest.approx(true.size_m, abs=0.004)
+    assert found.mesh.size_m == pytest.approx(true.size_m, abs=0.005)
     assert "Its underside was not seen: it is taken to be flat." in found.notes
     assert 0.5 < found.seen < 0.8
     for azimuth in (0.3, 2.0, 4.0):
         error = np.abs(drawn(found.mesh, azimuth) - drawn(true, azimuth)).mean()
-        assert error < 0.35 * np.abs(drawn(true, azimuth + 1.5) - drawn(true, azimuth)).mean()
+        assert error < 0.25 * np.abs(drawn(true, azimuth + 1.5) - drawn(true, azimuth)).mean()
 
 
 def test_one_round_from_above_is_cut_where_the_outlines_end(tmp_path):
@@ -127,16 +135,19 @@ def called(monkeypatch, *words):
     return end.value.code
 
 
-def test_an_object_is_added_from_views_with_its_card_and_learnt(taken, home, capsys, monkeypatch):
+def test_an_object_is_added_from_views_with_its_card_and_learnt(taken, home, coarse, monkeypatch):
+    """Learning itself is the same as for meshes."""
+    learnt = []
+    monkeypatch.setattr("saccade.app.objects.adding._learn", lambda objects, folder, console: learnt.append(objects))
     assert called(monkeypatch, "--views", taken, "--poses", taken, "--name", "cup") == 0
     card = read_card(home / "my" / "cup")
     assert (card["source"], card["views"], card["up"]) == ("views", len(cameras()), "z")
     assert "Its underside was not seen: it is taken to be flat." in card["notes"]
-    assert Weights(home / "my" / f"weights-{OPEN}").names == ("cup",)
-    assert "use it with `--objects my`" in capsys.readouterr().out
+    assert learnt == ["my"]
+    assert load_mesh("my", "cup").size_m == pytest.approx(mesh().size_m, abs=0.01)
 
 
-def test_scale_and_up_say_how_the_poses_are_meant(tmp_path):
+def test_scale_and_up_say_how_the_poses_are_meant(tmp_path, coarse):
     """The file's world is in decimetres, with y up."""
     turn = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
     folder = write(tmp_path / "tea", [camera for camera in cameras((0.2, 0.8), 8)], scale=0.1)
@@ -144,7 +155,7 @@ def test_scale_and_up_say_how_the_poses_are_meant(tmp_path):
     for frame in told["frames"]:
         frame["transform_matrix"] = (turn @ np.array(frame["transform_matrix"])).tolist()
     (folder / "transforms.json").write_text(json.dumps(told))
-    assert made(folder, up="y", scale=0.1).mesh.size_m == pytest.approx(mesh().size_m, abs=0.006)
+    assert made(folder, up="y", scale=0.1).mesh.size_m == pytest.approx(mesh().size_m, abs=0.012)
 
 
 # --- what belongs to the object
@@ -187,14 +198,14 @@ def test_a_plain_background_shows_through_a_handle_and_not_through_a_highlight()
     assert plain_mask(image.astype(np.uint8)) is None
 
 
-def test_pictures_whose_outlines_do_not_fit_the_others_are_left_out(changed):
+def test_pictures_whose_outlines_do_not_fit_the_others_are_left_out(changed, coarse):
     for number in (4, 17):
         mask = np.asarray(Image.open(changed / "masks" / f"{number:03}.png"))
         Image.fromarray(np.roll(mask, 60, axis=1)).save(changed / "masks" / f"{number:03}.png")
     found = made(changed, changed / "masks")
     assert found.views == len(cameras()) - 2
     assert "2 pictures are left out, because their outlines do not fit the others." in found.notes
-    assert found.mesh.size_m == pytest.approx(mesh().size_m, abs=0.005)
+    assert found.mesh.size_m == pytest.approx(mesh().size_m, abs=0.01)
 
 
 def test_the_distortion_of_a_lens_is_removed_from_a_picture(tmp_path):
@@ -304,7 +315,7 @@ def damaged(folder):
     (nothing_there, "nothing is seen of the object"),
     (damaged, "picture .*003.png cannot be read"),
 ])
-def test_pictures_that_cannot_be_used_are_one_line_and_nothing_is_kept(changed, home, damage, words):
+def test_pictures_that_cannot_be_used_are_one_line_and_nothing_is_kept(changed, home, coarse, damage, words):
     damage(changed)
     with pytest.raises(SaccadeError, match=words) as error:
         add_views(changed, "my", name="tea", told=Told(changed), masks=None, ask=None, console=Console(quiet=True))
@@ -314,7 +325,7 @@ def test_pictures_that_cannot_be_used_are_one_line_and_nothing_is_kept(changed, 
 
 @pytest.mark.parametrize(("scale", "words"), [
     (0.0005, "object 'tea' would be 0.000.* m large: give --scale"), (200.0, "m large: give --scale|beyond")])
-def test_a_scale_that_no_object_has_is_one_line(taken, scale, words):
+def test_a_scale_that_no_object_has_is_one_line(taken, coarse, scale, words):
     with pytest.raises(SaccadeError, match=words):
         made(taken, scale=scale)
 

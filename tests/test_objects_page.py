@@ -43,10 +43,9 @@ def desk(tmp_path, monkeypatch):
 
 def call(monkeypatch, line):
     monkeypatch.setattr(sys, "argv", shlex.split(line))
-    try:
+    with pytest.raises(SystemExit) as end:
         main()
-    except SystemExit as end:
-        assert end.code in (0, None), line
+    assert end.value.code in (0, None), line
 
 
 def test_the_page_is_followed_word_by_word(desk, monkeypatch, capsys):

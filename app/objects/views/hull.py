@@ -22,7 +22,8 @@ COARSE, FINE = 40, 104  # points along the longest side of the grid
 WIDER = 1.25  # than the outlines, where the coarse grid begins
 COVERED = 0.92  # of a view's outline: otherwise it is not that of the same object
 AGREEING = 0.6  # of the views
-NEEDS = "making an object from pictures needs the library scikit-image: pip install 'saccade[objects]'"
+NEEDS = ("making an object from pictures needs the libraries scikit-image and fast-simplification: pip install "
+         "'saccade[objects]'")
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,7 @@ class Hull:
 def hull_of(views: list[View]) -> Hull:
     """The hull of an object. Raises SaccadeError if the outlines are not those of one object."""
     try:
+        import fast_simplification  # noqa: F401  # which `simplified` needs
         from skimage.measure import marching_cubes
     except ImportError as error:
         raise SaccadeError(NEEDS) from error
