@@ -36,7 +36,8 @@ def desk(tmp_path, monkeypatch):
     material = trimesh.visual.material.PBRMaterial(baseColorTexture=Image.fromarray(mesh.texture))
     shape = trimesh.Trimesh(mesh.vertices_m[:, [0, 2, 1]] * (1, 1, -1), mesh.faces, process=False)
     shape.visual = trimesh.visual.TextureVisuals(uv=mesh.texcoords, material=material)
-    shape.export(tmp_path / "tea.glb")
+    data = shape.export(file_type="glb")  # not as from the library, which does not keep to the definition of the axes
+    (tmp_path / "tea.glb").write_bytes(data.replace(b"mikedh/trimesh", b"another/progra"))
     Image.fromarray(np.full((240, 320, 3), 120, dtype=np.uint8)).save(tmp_path / "photo.jpg")
     return tmp_path
 

@@ -61,7 +61,9 @@ def hull_of(views: list[View]) -> Hull:
                            "its length, or do the poses not fit the pictures?")
     padded = np.pad(least.inside_m, 1, constant_values=-least.pitch_m)
     points, faces, *_ = marching_cubes(padded, 0.0, gradient_direction="ascent")
-    points, faces, _ = simplified(points.astype(np.float64), faces.astype(np.int64), MANY_FACES)
+    points, faces = points.astype(np.float64), faces.astype(np.int64)
+    if len(faces) > MANY_FACES:
+        points, faces, _ = simplified(points, faces, MANY_FACES)
     return Hull(least.low_m + least.pitch_m * (points - 1), faces, views)
 
 
