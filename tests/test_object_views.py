@@ -326,7 +326,7 @@ def test_pictures_that_cannot_be_used_are_one_line_and_nothing_is_kept(changed, 
 
 
 @pytest.mark.parametrize(("scale", "words"), [
-    (0.0005, "object 'tea' would be 0.000.* m large: give --scale"), (200.0, "m large: give --scale|beyond")])
+    (0.0005, "object 'tea' would be 0.08.* mm large: give --scale"), (200.0, "m large: give --scale|beyond")])
 def test_a_scale_that_no_object_has_is_one_line(taken, coarse, scale, words):
     with pytest.raises(SaccadeError, match=words):
         made(taken, scale=scale)

@@ -67,9 +67,10 @@ def test_the_page_is_followed_word_by_word(desk, monkeypatch, capsys):
 
 
 def told_as_the_page_says(said):
-    for words in ("because glTF files are in metres by definition", "it does in glTF files by definition",
-                  "tea: turned about the vertical, it looks different from each side", "its picture is",
-                  "learnt tea: 1 object in", "use it with `--objects my`"):
+    for words in ("tea: The lengths are in metres, because glTF files are in metres by definition: the largest side is",
+                  "tea: The axis y points up, because glTF files have y up by definition; if the object lies on its "
+                  "side, give --up z.", "tea: turned about the vertical, it looks different from each side",
+                  "its picture is", "learnt tea: 1 object in", "use it with `--objects my`"):
         assert words in said
         assert words in PAGE
 

@@ -47,7 +47,8 @@ def mesh_from_views(source: Path, name: str, told: Told, masks: Path | None = No
     low, high = hull.points_m.min(0), hull.points_m.max(0)
     largest = float((high - low).max())
     if not SIZES_M[0] <= largest <= SIZES_M[1]:
-        raise SaccadeError(f"object {name!r} would be {largest:.3g} m large: give --scale, the length in metres of the "
+        size = f"{largest:.3g} m" if largest >= 1 else f"{1000 * largest:.3g} mm"
+        raise SaccadeError(f"object {name!r} would be {size} large: give --scale, the length in metres of the "
                            "unit of the poses")
     directions = directions_of(hull.views, (low + high) / 2)
     around = _around(directions)
