@@ -5,13 +5,14 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
+from pathlib import Path
 
 import kubernetes_validate
 import pytest
 import yaml
 
 from saccade.app.run.registry import agent_processes
-from saccade.shared.config import PACKAGE
+from saccade.shared.config import PACKAGE, set_folder
 
 PROCESSES = {process.name: process.module for process in agent_processes("sceneccn", view=True)}
 BESIDE = {"director"}  # in the launcher's place
@@ -55,6 +56,25 @@ def test_all_start_the_same_processes(compose, kubernetes):
     for name in (*PROCESSES, *BESIDE):
         assert in_compose[name]["image"] == in_kubernetes[name]["image"].removesuffix(":latest") == f"saccade/{name}"
         assert bytes_of(in_compose[name]["mem_limit"]) == bytes_of(in_kubernetes[name]["resources"]["limits"]["memory"])
+
+
+def test_whoever_reads_objects_or_what_is_learnt_of_them_has_the_users_own_sets(compose):
+    readers = {"director", "simulator", "perception", "belief", "planner", "evaluator", "recorder", "viewer", "replay"}
+    for name in readers:
+        sets, = (volume for volume in compose[name]["volumes"]
+                 if isinstance(volume, dict) and volume["target"] == "/sets")
+        assert compose[name]["environment"]["SACCADE_OBJECTS"] == "/sets"
+        assert sets["read_only"]
+        assert sets["source"] == "${SACCADE_SETS:-${XDG_DATA_HOME:-${HOME:-.}/.local/share}/saccade/objects}"
+    assert "--objects=${SACCADE_OBJECTS:-pantry}" in compose["director"]["command"]
+
+
+def test_the_folder_of_sets_in_a_container_is_where_a_run_finds_them(tmp_path, monkeypatch):
+    monkeypatch.setenv("SACCADE_OBJECTS", "/sets")  # as compose.yaml sets it
+    assert set_folder("my") == Path("/sets/my")
+    monkeypatch.delenv("SACCADE_OBJECTS")
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
+    assert set_folder("my") == tmp_path / "saccade" / "objects" / "my"  # which compose.yaml mounts there
 
 
 def test_each_has_an_image_whose_container_starts_its_module(kubernetes):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -25,9 +26,12 @@ from saccade.app.objects.store import (
     require_there,
 )
 from saccade.app.objects.symmetry import symmetry_of
+from saccade.app.objects.views.meshing import mesh_from_views
+from saccade.app.objects.views.pictures import Told
 from saccade.app.run.display import say
 from saccade.shared.errors import SaccadeError
-from saccade.shared.render.foreign_mesh import Imported, read_mesh
+from saccade.shared.render.foreign_mesh import read_mesh
+from saccade.shared.render.mesh import Mesh
 from saccade.shared.render.objects import names_of
 from saccade.shared.world.symmetry import symmetry_words
 
@@ -54,24 +58,42 @@ def add_meshes(paths: Sequence[Path], objects: str, *, name: str | None, unit: L
                 failed += 1
                 print(f"saccade: {error}", file=sys.stderr)
                 continue
-            added += _add(folder, path, imported, ask, console, symmetry)
+            card = Card(str(path), imported.unit, imported.up, imported.notes)
+            added += _add(folder, imported.mesh, card, ask, console, symmetry)
         if added:
             _learn(objects, folder, console)
     if failed:
         raise SaccadeError(f"{failed} of {len(paths)} meshes could not be added: see above")
 
 
-def _add(folder: Path, path: Path, imported: Imported, ask: Ask | None, console: Console,
-         symmetry: int | None) -> bool:
-    """Keeps a mesh, if it is right. Returns whether it is."""
-    mesh, picture = imported.mesh, turntable(imported.mesh)
+def add_views(source: Path, objects: str, *, name: str | None, told: Told, masks: Path | None, ask: Ask | None,
+              console: Console, symmetry: int | None = None) -> None:
+    """Adds an object to a set of the user's from pictures around it, and learns it. `source` is their folder or a
+    video, `told` what is known of the camera, and `masks` a folder with a mask for each picture; for the rest see
+    `add_meshes`.
+
+    Raises SaccadeError if nothing can be made of the pictures; then nothing is kept.
+    """
+    folder, known = own_folder(objects), name_from(source, name)
+    with alone_in(folder):
+        require_free(folder, [known])
+        made = mesh_from_views(source, known, told, masks)
+        card = Card("views", "m", "z", made.notes, views=made.views, seen=made.seen)
+        if _add(folder, made.mesh, card, ask, console, symmetry, "--scale, --up and --symmetry say how they are meant"):
+            _learn(objects, folder, console)
+
+
+def _add(folder: Path, mesh: Mesh, card: Card, ask: Ask | None, console: Console, symmetry: int | None,
+         advice: str = "--unit, --up and --symmetry say how the file is meant") -> bool:
+    """Keeps a mesh with its card, to which the symmetry is added, if it is right. Returns whether it is."""
+    picture = turntable(mesh)
     found = symmetry_of(mesh) if symmetry is None else None
     known = symmetry if found is None else found
     assert known is not None  # it is one of the two
-    for note in imported.notes:
+    for note in card.notes:
         say(console, f"{mesh.name}: {note}")
     size = " x ".join(f"{100 * side:.1f}" for side in mesh.size_m)
-    card = Card(str(path), imported.unit, imported.up, imported.notes, symmetry=known, symmetry_found=found)
+    card = replace(card, symmetry=known, symmetry_found=found)
     say(console, f"{mesh.name}: turned about the vertical, it {symmetry_words(known)}")
     if ask is None:
         say(console, f"{mesh.name}: {size} cm; its picture is {keep(folder, mesh, card, picture) / TURNTABLE}")
@@ -82,7 +104,7 @@ def _add(folder: Path, path: Path, imported: Imported, ask: Ask | None, console:
     if right:
         keep(folder, mesh, card, picture)
     else:
-        say(console, f"{mesh.name} is not added: --unit, --up and --symmetry say how the file is meant")
+        say(console, f"{mesh.name} is not added: {advice}")
     return right
 
 

@@ -33,7 +33,8 @@ DIAGONAL_M = 0.5  # to which an object is scaled for its picture, so that it is 
 @dataclass(frozen=True)
 class Card:
     """What is known of an object beside its mesh: where it came from, what was done with it, and its symmetry. The
-    symmetry that was found is None if the user told the symmetry."""
+    symmetry that was found is None if the user told the symmetry. If it was made from pictures, `views` says from how
+    many, and `seen` which share of all directions they show."""
 
     source: str
     unit: str
@@ -42,10 +43,13 @@ class Card:
     licence: str = ""
     symmetry: int = NONE
     symmetry_found: int | None = None
+    views: int | None = None
+    seen: float | None = None
 
     def text(self, mesh: Mesh, mesh_sha256: str) -> str:
         """The file's text, TOML."""
-        return _lines({"name": mesh.name, "source": self.source, "unit": self.unit, "up": self.up,
+        seen = {} if self.views is None else {"views": self.views, "seen": round(self.seen or 0.0, 2)}
+        return _lines({"name": mesh.name, "source": self.source, **seen, "unit": self.unit, "up": self.up,
                        "licence": self.licence, "notes": list(self.notes),
                        **_measured(mesh, mesh_sha256, self.symmetry, self.symmetry_found)})
 

@@ -22,7 +22,7 @@ from saccade.shared.world.symmetry import symmetry_words
 
 ALIKE, IN_MATRIX = 3, 8  # how many others are told in words, and how many objects the matrix has at most
 ELEVATIONS_RAD = (1.2, 0.6, 0.1)  # of the views of the bank that are shown
-TOLD = ("source", "unit", "up", "licence")  # keys of the card
+TOLD = ("source", "views", "unit", "up", "licence")  # keys of the card
 
 
 @dataclass(frozen=True)

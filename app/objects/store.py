@@ -46,7 +46,8 @@ def own_folder(objects: str) -> Path:
 
 def name_from(path: Path, given: str | None) -> str:
     """The name of an object: the given one, or that of its file. Raises SaccadeError if none can be had."""
-    generic = ("textured", "mesh", "model", "scene", "object", "untitled")
+    generic = ("textured", "mesh", "model", "scene", "object", "untitled", "images", "frames",
+               "views", "video")
     stem = path.parent.name if path.stem.lower() in generic and path.parent.name else path.stem
     name = given if given is not None else re.sub(r"[^A-Za-z0-9_-]+", "_", stem).strip("_")[:64]
     if not re.fullmatch(WORLD, name) or name.startswith(("-", RESERVED)):

@@ -108,14 +108,21 @@ class Folder:
 
     def __init__(self, path: Path, rate_hz: float = DEFAULT_RATE_HZ):
         self.name, self.period_s = str(path), 1.0 / rate_hz
-        self.paths = sorted(_images_in(path), key=_natural)
-        if not self.paths:
-            raise SaccadeError(f"folder {path} holds no image: put PNG or JPEG files into it")
+        self.paths = image_paths(path)
         self.size_px = _common_size(self.paths)
 
     def __iter__(self) -> Iterator[SourceImage]:
         for index, path in enumerate(self.paths):
             yield SourceImage(read_image(path), index, index * self.period_s, path.name)
+
+
+def image_paths(folder: Path) -> list[Path]:
+    """The PNG and JPEG files of a folder, without hidden files, sorted by name. Raises SaccadeError if there are none
+    or too many, or if the folder cannot be read."""
+    paths = sorted(_images_in(folder), key=_natural)
+    if not paths:
+        raise SaccadeError(f"folder {folder} holds no image: put PNG or JPEG files into it")
+    return paths
 
 
 def _images_in(folder: Path) -> list[Path]:

@@ -63,7 +63,8 @@ def read_mesh(path: Path, name: str, *, unit: Literal["m", "cm", "mm", "auto"] =
         parts = _without_flat(thinned(parts), path)
         remain = sum(len(part.corners) for part in parts)
         notes.append(f"The mesh was simplified from {len(corners)} to {remain} faces, so that it is rendered fast.")
-    return Imported(_mesh(parts, name, METRES[chosen], axis, path), tuple(dict.fromkeys(notes)), chosen, axis, files)
+    mesh = joined_mesh(parts, name, METRES[chosen], axis, path)
+    return Imported(mesh, tuple(dict.fromkeys(notes)), chosen, axis, files)
 
 
 def _files(path: Path) -> tuple[Path, ...]:
@@ -136,7 +137,9 @@ def _closed_note(corners: NDArray[np.float64]) -> list[str]:
             "sees through it."] if count else []
 
 
-def _mesh(parts: list[Part], name: str, metres: float, axis: str, path: Path) -> Mesh:
+def joined_mesh(parts: list[Part], name: str, metres: float, axis: str, path: Path) -> Mesh:
+    """Parts whose unit has this length, with this axis up, as one mesh. Raises SaccadeError, which names the path, if
+    they have too many textures and colours."""
     corners = np.concatenate([part.corners for part in parts])
     if axis == "y":
         corners = corners @ _Z_FROM_Y_UP.T

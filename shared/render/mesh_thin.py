@@ -47,7 +47,7 @@ def _thinned(part: Part, target: int) -> Part:
     rows, inverse = weld(np.concatenate([((part.corners - low) / side).reshape(-1, 3),
                                          looks.reshape(-1, looks.shape[-1]).astype(np.float64)], axis=1))
     faces = inverse.reshape(-1, 3)
-    points, faces, became = _simplified(rows[:, :3].astype(np.float64), faces, target)
+    points, faces, became = simplified(rows[:, :3].astype(np.float64), faces, target)
     look = _means(rows, became, points)[faces]
     corners = points[faces] * side + low
     if part.uv is not None:
@@ -55,7 +55,7 @@ def _thinned(part: Part, target: int) -> Part:
     return Part(corners, colours=np.clip(look.round(), 0, 255).astype(np.uint8))
 
 
-def _simplified(points: NDArray[np.float64], faces: NDArray[np.int64],
+def simplified(points: NDArray[np.float64], faces: NDArray[np.int64],
                 target: int) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
     """New points [V, 3], faces [F, 3], and which new point each old one became [V before]."""
     import fast_simplification as library

@@ -26,6 +26,7 @@ NAMES: dict[str, str] = {
     "json-lines": "JSON lines", "tum": "a TUM trajectory", "kitti": "KITTI", "euroc": "EuRoC CSV",
     "transforms": "transforms.json of nerfstudio or instant-ngp", "colmap": "COLMAP", "record3d": "Record3D",
     "stray": "Stray Scanner"}
+ORIGIN_NOTE = "the origin is the file's; the agent expects it on the table, whose top is at z = 0"
 _AXES_NAMES = {"opengl": "OpenGL camera axes", "opencv": "OpenCV camera axes"}
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # between the two camera axes, in both directions
 _WORLD_FROM_FILE = {  # rotations [3, 3] that turn the axis which points up onto z
@@ -166,5 +167,5 @@ def _notes(stored: Stored, asked: Asked, up: str | None, epoch_s: float) -> list
         done = "is undone" if asked.original else "is kept as part of the poses; camera.poses_original undoes it"
         notes.append(f"applied_transform {done}")
     if stored.format not in ("json-lines", "tum"):
-        notes.append("the origin is the file's; the agent expects it on the table, whose top is at z = 0")
+        notes.append(ORIGIN_NOTE)
     return notes
