@@ -245,6 +245,10 @@ class PlannerConfig(Section):
     """How many candidate viewpoints are drawn."""
     replan_every: int = Field(10, ge=1, le=MANY)
     """A new viewpoint is chosen after this many steps, or on arrival."""
+    moved_by: Literal["agent", "hand", "recording"] | None = None
+    """Who moves the camera. `agent`: it carries out every action. `hand`: a person, who needs many images to come to a
+    viewpoint, so that the plan stays until it is reached or the hand goes elsewhere. `recording`: nobody. Without it,
+    `hand` for a camera that runs now, `recording` for other images, and `agent` in the simulator."""
     step_m: float = Field(0.05, gt=0, le=0.5)
     """How far the camera moves in one step."""
     range_std_m: float = Field(0.025, gt=0, le=10)

@@ -117,8 +117,10 @@ def in_world(config: Config, world: str) -> Config:
     if scene.file or scene.scene or scene.n_objects or scene.count > 1:
         raise SaccadeError(f"scenes are the simulator's: in the world {world!r} give no scenes file, no scene, and no "
                            "number of objects or scenes")
+    mover = "hand" if camera.source is not None and is_live(camera.source) else None
     config = config.with_values({"scene.explore": scene.explore or scene.goal_image is None,
-                                 "bus.live": config.bus.kind == "zenoh"})
+                                 "bus.live": config.bus.kind == "zenoh",
+                                 "planner.moved_by": config.planner.moved_by or mover})
     from_outside = config.services.source is not None
     if not from_outside:
         require_one_of_each(camera)
