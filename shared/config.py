@@ -287,6 +287,8 @@ class ViewerConfig(Section):
     """Token that a browser must give. The launcher draws a new one for every run and prints it in the address."""
     port: int = Field(9090, ge=1, le=65535)
     """Port of the page."""
+    guide_port: int = Field(9092, ge=1, le=65535)
+    """Port of the page that guides a hand that holds the camera. It listens on the viewer's address."""
     data_port: int = Field(0, ge=0, le=65535)
     """Port for Rerun viewers that are not a browser. With 0, a free port is picked."""
     memory_mb: int = Field(1024, ge=16, le=1_000_000)

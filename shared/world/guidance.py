@@ -12,9 +12,8 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
-from saccade.shared.world.geometry import Array, look_at, pixel_rays, project, unit
+from saccade.shared.world.geometry import Array, look_at, pixel_rays, project, rotation_vector, unit
 
 State = Literal["move", "hold", "there"]
 
@@ -61,7 +60,7 @@ def guide(world_from_camera: ArrayLike, viewpoint: ArrayLike, look_at_m: ArrayLi
     straight = wanted[:3, 3] - camera[:3, 3]
     distance_m = float(np.linalg.norm(straight))
     move = distance_m * _way(straight, step_m)
-    turn = Rotation.from_matrix(camera[:3, :3].T @ attitude(camera, wanted, look_at_m)[:3, :3]).as_rotvec()
+    turn = rotation_vector(camera[:3, :3].T @ attitude(camera, wanted, look_at_m)[:3, :3])
     turn_rad = float(np.linalg.norm(turn))
     near = distance_m < NEAR_M and turn_rad < NEAR_RAD
     state: State = "there" if there else "hold" if near else "move"
