@@ -7,7 +7,7 @@ import pytest
 
 from saccade.app.run.run import in_world
 from saccade.services.planner.core import build
-from saccade.services.planner.hand import ELSEWHERE_M, LOOKS, MOVED_M, PATIENCE, Hand
+from saccade.services.planner.hand import ELSEWHERE_M, LOOKS, MOST_LOOKS, MOVED_M, PATIENCE, SHIFTED_M, Hand
 from saccade.shared.bus.messages import Belief, Percept
 from saccade.shared.config import Config
 from saccade.shared.world.geometry import INTRINSICS_PX, look_at, pose, viewing_grid
@@ -17,7 +17,7 @@ from saccade.shared.world.task import Spheres, spheres_around, start_pose, succe
 GOAL = look_at((0.4, 0.0, 0.3), (0.0, 0.0, 0.05))
 EYE = GOAL[:3, 3]
 FREE = Spheres(np.zeros((0, 3)), np.zeros(0))
-SURE, OLD = 0.6, 10
+OLD = 10
 
 
 def at(away_m, viewpoint=GOAL) -> np.ndarray:
@@ -31,7 +31,7 @@ def followed(spheres=FREE) -> Hand:
 
 
 def verdicts(hand, poses, goal_here=0.9, eye=EYE) -> list[str]:
-    return [hand.take(camera, goal_here, eye, sure=SURE) for camera in poses]
+    return [hand.take(camera, goal_here, eye) for camera in poses]
 
 
 def test_the_plan_waits_for_the_hand():
@@ -45,7 +45,7 @@ def test_a_hand_that_goes_elsewhere_gets_another_plan():
         "stay", "stay", "stay", "renew"]
 
 
-@pytest.mark.parametrize(("goal_here", "verdict"), [(0.9, "there"), (0.3, "wrong")])
+@pytest.mark.parametrize(("goal_here", "verdict"), [(0.9, "there"), (0.1, "wrong")])
 def test_several_looks_decide_whether_it_is_the_goal(goal_here, verdict):
     hand = followed()
     assert verdicts(hand, [at(0.2)] + [at(NEAR_M / 2)] * LOOKS, goal_here) == ["stay"] * LOOKS + [verdict]
@@ -53,8 +53,20 @@ def test_several_looks_decide_whether_it_is_the_goal(goal_here, verdict):
 
 def test_one_look_does_not_decide_against_the_others():
     hand = followed()
-    looks = [hand.take(at(0), here, EYE, sure=SURE) for here in (0.9, 0.9, 0.1, 0.9, 0.9)]
+    looks = [hand.take(at(0), here, EYE) for here in (0.9, 0.9, 0.1, 0.9, 0.9)]
     assert looks[-1] == "there"
+
+
+def test_where_looks_leave_a_doubt_there_are_more_of_them():
+    assert verdicts(followed(), [at(0)] * MOST_LOOKS, goal_here=0.4) == ["stay"] * (MOST_LOOKS - 1) + ["wrong"]
+    hand = followed()
+    assert set(verdicts(hand, [at(0)] * LOOKS, goal_here=0.4)) == {"stay"}
+    assert "there" in verdicts(hand, [at(0)] * LOOKS, goal_here=0.9)
+
+
+def test_before_it_decides_the_hand_is_led_to_where_the_goal_is_believed_now():
+    shifted = EYE + np.array([0.0, 0.0, 1.2 * SHIFTED_M])
+    assert verdicts(followed(), [at(0)] * LOOKS, eye=shifted)[-1] == "renew"
 
 
 def test_a_hand_that_cannot_come_nearer_is_asked_no_more():

@@ -140,7 +140,7 @@ class Planner:
         if mode != chosen.mode and not self.hand.there:
             return True, False
         goal_here = beliefs[chosen.target].goal_here if chosen.mode == "goal" else None
-        verdict = self.hand.take(camera, goal_here, eye, sure=SURE)
+        verdict = self.hand.take(camera, goal_here, eye)
         if verdict == "wrong" and self.config.planner.retry:
             self.visited.append(camera)
         return verdict in ("renew", "wrong"), verdict == "there"

@@ -12,10 +12,12 @@ from saccade.shared.world.task import Spheres, clip, success
 
 Verdict = Literal["stay", "renew", "wrong", "there"]
 
-LOOKS = 5  # chosen: so many images decide whether a view is the goal's
+LOOKS, MOST_LOOKS = 5, 15  # chosen: at least and at most so many images decide whether a view is the goal's
+LIKELY, UNLIKELY = 0.5, 0.25  # chosen: means of the looks above which a view is the goal's, and below which it is not
 PATIENCE = 20  # chosen: after so many images within the task's tolerance a hand will not come nearer
 ELSEWHERE_M = 0.15  # chosen: a hand goes elsewhere if it is so much farther from the viewpoint than it has been
 MOVED_M = 0.03  # chosen: a plan is renewed if the believed view of the goal moves by more than this
+SHIFTED_M = 0.015  # chosen: the same before it is decided whether the view is the goal's
 
 
 class Hand:
@@ -37,17 +39,17 @@ class Hand:
         self._looks: list[float] = []
         return self._viewpoint
 
-    def take(self, camera: Array, goal_here: float | None, eye: Array | None, *, sure: float) -> Verdict:
+    def take(self, camera: Array, goal_here: float | None, eye: Array | None) -> Verdict:
         """Takes the camera's pose [4, 4] in an image.
 
         A viewpoint from which to search is reached within the task's tolerance. At one that may be the goal's,
         `goal_here` is the probability that it is, by this image. There the camera must be nearer, unless it has not
-        come nearer for a while, and the mean of several images must be above `sure`; otherwise the view is wrong.
+        come nearer for a while, and the mean of several images decides.
         """
         self._age += 1
         if self.there:
             return "there" if success(camera, self._viewpoint) else "stay"
-        if goal_here is not None and self._age >= self._renewed_after and self._has_moved(eye):
+        if goal_here is not None and self._age >= self._renewed_after and self._has_moved(eye, MOVED_M):
             return "renew"
         away_m = float(np.linalg.norm(camera[:3, 3] - self._viewpoint[:3, 3]))
         self._nearest_m = min(self._nearest_m, away_m)
@@ -60,10 +62,19 @@ class Hand:
         near = away_m < NEAR_M and rotation_angle(camera[:3, :3], self._viewpoint[:3, :3]) < NEAR_RAD
         if len(self._looks) < (LOOKS if near else PATIENCE):
             return "stay"
-        self.there = bool(np.mean(self._looks[-LOOKS:]) > sure)
-        return "there" if self.there else "wrong"
+        if self._has_moved(eye, SHIFTED_M):
+            return "renew"
+        return self._judge()
 
-    def _has_moved(self, eye: Array | None) -> bool:
+    def _judge(self) -> Verdict:
+        """Whether the view is the goal's, by the looks at it so far; `stay` asks for more of them."""
+        mean = float(np.mean(self._looks[-MOST_LOOKS:]))
+        self.there = mean > LIKELY
+        if self.there:
+            return "there"
+        return "wrong" if mean < UNLIKELY or len(self._looks) >= MOST_LOOKS else "stay"
+
+    def _has_moved(self, eye: Array | None, by_m: float) -> bool:
         if eye is None or self._eye is None:
             return False
-        return bool(np.linalg.norm(eye - self._eye) > MOVED_M)
+        return bool(np.linalg.norm(eye - self._eye) > by_m)
