@@ -198,14 +198,14 @@ def main(out: Path, count: int = REHEARSALS) -> None:
     meshes = tuple(load_mesh(OBJECTS, name) for name in names)
     scenes = generate_split({mesh.name: mesh.size_m for mesh in meshes}, seed=SEED, repeats=REPEATS, yaw="fixed")
     records = {r["scene"]: r for r in json.loads(out.read_text())["rehearsals"]} if out.is_file() else {}
-    world, pairs = World(meshes), agent_pairs("sceneccn", config)
+    world, pairs, code = World(meshes), agent_pairs("sceneccn", config), commit()
     for number in np.linspace(0, len(scenes) - 1, min(count, len(scenes))).round().astype(int):
         scene = scenes[number]
         if scene.id in records:
             continue
         records[scene.id] = Rehearsal(world, scene, pairs, names, int(number)).run()
         print(json.dumps(records[scene.id]), flush=True)
-        result = {"commit": commit(), "objects": OBJECTS, "seed": SEED, "summary": summary([*records.values()]),
+        result = {"commit": code, "objects": OBJECTS, "seed": SEED, "summary": summary([*records.values()]),
                   "rehearsals": [*records.values()]}
         out.parent.mkdir(parents=True, exist_ok=True)
         out.write_text(json.dumps(result, indent=1) + "\n")
