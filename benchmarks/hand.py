@@ -35,7 +35,7 @@ from saccade.shared.world.guidance import Guidance, guide, level_axes
 from saccade.shared.world.task import Spheres, clip, equal_goals, nearest_goal, spheres_around, start_pose, success
 
 OBJECTS, SEED, REPEATS, REHEARSALS = "ycb", 14_142_135, 2, 50
-RATE_HZ, LONGEST_S = 10.0, 120.0
+RATE_HZ, LONGEST_S = 10.0, 60.0
 ANSWERED_EVERY = 2  # images; the agent's answer comes as many images later
 REACTION_S = 0.5
 SPEED_M_S, TURN_RAD_S = 0.2, np.radians(40)
@@ -205,7 +205,8 @@ def main(out: Path, count: int = REHEARSALS) -> None:
             continue
         records[scene.id] = Rehearsal(world, scene, pairs, names, int(number)).run()
         print(json.dumps(records[scene.id]), flush=True)
-        result = {"commit": code, "objects": OBJECTS, "seed": SEED, "summary": summary([*records.values()]),
+        result = {"commit": code, "objects": OBJECTS, "seed": SEED, "longest_s": LONGEST_S,
+                  "summary": summary([*records.values()]),
                   "rehearsals": [*records.values()]}
         out.parent.mkdir(parents=True, exist_ok=True)
         out.write_text(json.dumps(result, indent=1) + "\n")

@@ -22,7 +22,7 @@ PAGE = Path(__file__).with_name("page.html")
 MOST = 32  # connections at the same time; more are closed at once
 HEAD_BYTES, ANSWER_S = 16 * 1024, 10.0  # the longest head of a request, and how long a connection lasts at most
 REASONS = {200: "OK", 302: "Found", 400: "Bad Request", 403: "Forbidden", 404: "Not Found", 405: "Method Not Allowed"}
-POLICY = ("default-src 'none'; img-src 'self' blob:; connect-src 'self'; script-src 'unsafe-inline'; "
+POLICY = ("default-src 'none'; img-src 'self' blob: data:; connect-src 'self'; script-src 'unsafe-inline'; "
           "style-src 'unsafe-inline'")
 END = b"\r\n\r\n"
 
