@@ -9,7 +9,6 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 from arm.arm import Arm
-
 from saccade.services.simulator.core import SERVICE as SIMULATOR
 from saccade.services.simulator.core import Simulator
 from saccade.services.simulator.core import build as build_simulator

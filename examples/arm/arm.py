@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import mujoco
 import numpy as np
 
+from saccade.shared.render.opengl import choose_backend
 from saccade.shared.world.geometry import Array, pose, rotation_vector
+
+choose_backend()  # before MuJoCo is loaded: the table is rendered in the same process
+import mujoco  # noqa: E402
 
 MODEL = Path(__file__).with_name("arm.xml")
 READY = (0.0, -1.2, 2.1, 0.0, 0.4, 0.0)  # joints above the table, from which the first pose is looked for
