@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 
-from arm.arm import Arm
 from saccade.services.simulator.core import SERVICE as SIMULATOR
 from saccade.services.simulator.core import Simulator
 from saccade.services.simulator.core import build as build_simulator
@@ -17,6 +16,8 @@ from saccade.shared.config import Config
 from saccade.shared.loop.service import Inputs
 from saccade.shared.world.geometry import euler_xyz
 from saccade.shared.world.task import apply_action, clip
+
+from .arm import Arm
 
 SERVICE = SIMULATOR  # the same topics
 SECONDS = 0.6  # the time that the arm has for one action
