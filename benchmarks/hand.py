@@ -191,26 +191,27 @@ def summary(records: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def main(out: Path, count: int = REHEARSALS) -> None:
-    """Rehearses, prints a line for each rehearsal, and writes the results after each."""
+    """Rehearses in scenes that are chosen evenly, prints a line for each rehearsal, and writes the results after each.
+    The summary is that of the chosen scenes."""
     names = names_of(OBJECTS)
     config = Config().with_values({"scene.objects": OBJECTS, "scene.names": list(names), "bus.kind": "local",
                                    "planner.moved_by": "hand", "seed": SEED})
     meshes = tuple(load_mesh(OBJECTS, name) for name in names)
     scenes = generate_split({mesh.name: mesh.size_m for mesh in meshes}, seed=SEED, repeats=REPEATS, yaw="fixed")
     records = {r["scene"]: r for r in json.loads(out.read_text())["rehearsals"]} if out.is_file() else {}
+    chosen = np.linspace(0, len(scenes) - 1, min(count, len(scenes))).round().astype(int)
     world, pairs, code = World(meshes), agent_pairs("sceneccn", config), commit()
-    for number in np.linspace(0, len(scenes) - 1, min(count, len(scenes))).round().astype(int):
+    out.parent.mkdir(parents=True, exist_ok=True)
+    for number in map(int, chosen):
         scene = scenes[number]
-        if scene.id in records:
-            continue
-        records[scene.id] = Rehearsal(world, scene, pairs, names, int(number)).run()
-        print(json.dumps(records[scene.id]), flush=True)
-        result = {"commit": code, "objects": OBJECTS, "seed": SEED, "longest_s": LONGEST_S,
-                  "summary": summary([*records.values()]),
+        if scene.id not in records:
+            records[scene.id] = {**Rehearsal(world, scene, pairs, names, number).run(), "commit": code}
+            print(json.dumps(records[scene.id]), flush=True)
+        told = summary([records[scenes[k].id] for k in chosen if scenes[k].id in records])
+        result = {"objects": OBJECTS, "seed": SEED, "longest_s": LONGEST_S, "chosen": len(chosen), "summary": told,
                   "rehearsals": [*records.values()]}
-        out.parent.mkdir(parents=True, exist_ok=True)
         out.write_text(json.dumps(result, indent=1) + "\n")
-    print(json.dumps(summary([*records.values()]), indent=1))
+    print(json.dumps(told, indent=1))
 
 
 if __name__ == "__main__":
