@@ -153,7 +153,7 @@ def _name(parameter: Any) -> str:
     if parameter.param_type_name == "argument":
         return f"`{parameter.metavar or parameter.name.upper()}`"
     value = word_of(parameter).replace("|", "\\|")
-    return f"`{' '.join([', '.join(parameter.opts), value]).strip()}`"
+    return f"`{' '.join([', '.join([*parameter.opts, *parameter.secondary_opts]), value]).strip()}`"
 
 
 def _default(parameter: Any) -> str:

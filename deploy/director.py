@@ -30,8 +30,8 @@ from saccade.app.run.registry import AGENTS, DEFAULT_WORLD, WORLDS, agent_proces
 from saccade.app.run.summary import summary
 from saccade.app.run.supervisor import HUNG_S, Process
 from saccade.deploy.container import LATEST, OVER, ROUTER_S, heartbeat_file, runs_folder
-from saccade.services.viewer.admission import with_token
 from saccade.services.viewer.server import url_of
+from saccade.shared.admission import with_token
 from saccade.shared.bus.messages import Message, Result
 from saccade.shared.bus.topics import BELIEF, FRAME, PLAN, RESULT, STATUS, TRUTH, Topic
 from saccade.shared.bus.transport import ZenohBus

@@ -245,6 +245,10 @@ class PlannerConfig(Section):
     """How many candidate viewpoints are drawn."""
     replan_every: int = Field(10, ge=1, le=MANY)
     """A new viewpoint is chosen after this many steps, or on arrival."""
+    moved_by: Literal["agent", "hand", "recording"] | None = None
+    """Who moves the camera. `agent`: it carries out every action. `hand`: a person, who needs many images to come to a
+    viewpoint, so that the plan stays until it is reached or the hand goes elsewhere. `recording`: nobody. Without it,
+    `hand` for a camera that runs now, `recording` for other images, and `agent` in the simulator."""
     step_m: float = Field(0.05, gt=0, le=0.5)
     """How far the camera moves in one step."""
     range_std_m: float = Field(0.025, gt=0, le=10)
@@ -283,6 +287,8 @@ class ViewerConfig(Section):
     """Token that a browser must give. The launcher draws a new one for every run and prints it in the address."""
     port: int = Field(9090, ge=1, le=65535)
     """Port of the page."""
+    guide_port: int = Field(9092, ge=1, le=65535)
+    """Port of the page that guides a hand that holds the camera. It listens on the viewer's address."""
     data_port: int = Field(0, ge=0, le=65535)
     """Port for Rerun viewers that are not a browser. With 0, a free port is picked."""
     memory_mb: int = Field(1024, ge=16, le=1_000_000)

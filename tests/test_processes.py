@@ -17,6 +17,7 @@ NEEDS = {
     "camera": {"scipy"},
     "viewer": set(),
     "ros": {"scipy"},
+    "guide": set(),
 }
 
 

@@ -21,7 +21,7 @@ from saccade.services.viewer.world import PATH_LENGTH
 from saccade.shared.bus.topics import BELIEF, FRAME, PERCEPT, PLAN, STATUS, TRUTH
 from saccade.shared.config import Config
 from saccade.shared.log.reading import RunReader
-from saccade.shared.world.geometry import look_at
+from saccade.shared.world.geometry import INTRINSICS_PX, look_at
 from saccade.tests.fakes.logs import story, write
 from saccade.tests.fixtures.make import GOLDEN
 from saccade.tests.front_door import call
@@ -116,6 +116,28 @@ def test_there_is_no_true_distance_to_a_goal_that_nobody_knows(tmp_path, scene):
     seen = Seen(tmp_path / "run.rrd")
     assert "/world/true" in seen.entities
     assert not seen.numbers("/distance/true")
+
+
+@pytest.mark.parametrize("moved_by", ["hand", "agent"])
+def test_a_hand_sees_on_the_image_where_to_go(tmp_path, moved_by):
+    recording = rr.RecordingStream("saccade")
+    recording.save(tmp_path / "run.rrd")
+    viewer = Viewer(recording, Config(scene={"names": NAMES}, planner={"moved_by": moved_by}), truth=False, live=False)
+    at = {"run": "r", "episode": 0}
+    camera, aim = look_at((0.4, 0.0, 0.3), np.zeros(3)), look_at((0.4, 0.0, 0.3), np.zeros(3))
+    aim[1, 3] += 0.08
+    frame = sample(FRAME.type, **at, step=0, rgb=np.zeros((480, 480, 3), np.uint8), world_from_camera=camera,
+                   intrinsics_px=np.array(INTRINSICS_PX))
+    viewer.take(FRAME, None, frame)
+    viewer.take(PLAN, None, sample(PLAN.type, **at, step=0, viewpoint=aim, look_at_m=np.zeros(3), arrived=False))
+    viewer.take(FRAME, None, replace(frame, step=1))
+    viewer.close()
+    recording.disconnect()
+    seen = Seen(tmp_path / "run.rrd")
+    words = {1: ["move 8 cm to the right"]} if moved_by == "hand" else {}
+    assert seen.of("/world/camera/image/guidance/ghost", "LineStrips2D:labels") == words
+    arrows = seen.of("/world/camera/image/guidance/arrow", "LineStrips2D:strips")
+    assert [len(strips[0]) for strips in arrows.values()] == [8] * len(words)
 
 
 def test_an_object_that_is_seen_has_box_mask_crop_and_reconstruction(monkeypatch, capsys, tmp_path):

@@ -14,9 +14,9 @@ import rerun as rr
 import yaml
 
 from saccade.deploy.director import main as direct
-from saccade.services.viewer.admission import Head, Rules, head_of, is_loopback
 from saccade.services.viewer.door import HTTP2, MOST, MOST_WAITING, Door
 from saccade.services.viewer.server import Server, free_port, url_of
+from saccade.shared.admission import Head, Rules, head_of, is_loopback
 from saccade.shared.config import PACKAGE, Config, ViewerConfig
 from saccade.tests.test_viewer_server import WAIT_S, answer_at, configured, until
 

@@ -76,6 +76,9 @@ def run(*, objects: Objects = None, names: Names = None, scenes: ScenesFile = No
         loop: Annotated[bool, typer.Option("--loop", help="Begin again with the first image after the last.")] = False,
         config: ConfigFile = None, values: Values = None,
         view: Annotated[bool, typer.Option("--view", help="Show the run in a browser while it goes on.")] = False,
+        guide: Annotated[bool | None, typer.Option(
+            "--guide/--no-guide", help="Serve a page that tells who holds the camera where to go next.",
+            show_default="for a camera that runs now")] = None,
         plain: Annotated[bool, typer.Option(
             "--plain", help="Print lines instead of the live display.")] = False) -> None:
     """Run the agent. The run's folder gets run.mcap (every message), config.json and picture.png."""
@@ -113,6 +116,6 @@ def run(*, objects: Objects = None, names: Names = None, scenes: ScenesFile = No
 
     resolved, agent = configured(config, given, values, agent)
     finished = run_agent(resolved, agent=agent, out=out, plain=plain, console=console, world=world, view=view,
-                         after=show)
+                         guide=guide, after=show)
     if finished.lacks:  # it was said when it happened
         raise typer.Exit(2)

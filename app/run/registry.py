@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from saccade.app.run.launch import JUDGE, RECORDER
-from saccade.app.run.supervisor import ROS, VIEWER, Process
+from saccade.app.run.supervisor import GUIDE, ROS, VIEWER, Process
 from saccade.app.run.threads import limit_torch
 from saccade.shared.bus.topics import TRUTH
 from saccade.shared.config import BUILT_IN_SETS, Config
@@ -122,15 +122,15 @@ def local_pairs(agent: str, config: Config, world: str = DEFAULT_WORLD) -> list[
 
 
 def agent_processes(agent: str, world: str = DEFAULT_WORLD, *, view: bool = False,
-                    ros: bool = False) -> tuple[Process, ...]:
+                    ros: bool = False, guide: bool = False) -> tuple[Process, ...]:
     """Returns the processes of a run on the bus: the router first, the source second, and the onlookers last: with
-    `view` the viewer, and with `ros` the bridge to ROS 2. Raises SaccadeError if the agent runs only within one
-    process."""
+    `view` the viewer, with `guide` the page that guides a hand, and with `ros` the bridge to ROS 2. Raises SaccadeError
+    if the agent runs only within one process."""
     chosen, place = agent_of(agent), world_of(world)
     if chosen.cores:
         raise SaccadeError(f"agent {agent!r} runs within one process only: add `--bus local`, or bus='local' in Python")
     names = (ROUTER, place.source, *chosen.services, *place.judges, RECORDER)
-    onlookers = (*((VIEWER,) if view else ()), *((ROS,) if ros else ()))
+    onlookers = (process for process, wanted in ((VIEWER, view), (GUIDE, guide), (ROS, ros)) if wanted)
     return (*(Process(name, f"saccade.services.{name}") for name in names), *onlookers)
 
 

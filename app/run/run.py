@@ -24,7 +24,7 @@ from saccade.services.camera.core import build as build_camera
 from saccade.services.camera.core import require_one_of_each
 from saccade.services.camera.sources import absolute, is_live
 from saccade.services.recorder.core import describe, to_be_finished
-from saccade.services.viewer.server import binary, url_of, with_free_ports
+from saccade.services.viewer.server import binary, guide_url_of, url_of, with_free_ports, with_guide
 from saccade.shared.bus.messages import Message, Result
 from saccade.shared.bus.topics import Topic
 from saccade.shared.config import Config
@@ -51,10 +51,12 @@ class Finished:
 
 
 def run(config: Config, *, agent: str, out: Path | None, plain: bool, console: Console | None = None,
-        world: str = DEFAULT_WORLD, view: bool = False, after: Callable[[Finished], None] | None = None) -> Finished:
+        world: str = DEFAULT_WORLD, view: bool = False, guide: bool | None = None,
+        after: Callable[[Finished], None] | None = None) -> Finished:
     """Runs all episodes of a configuration into a new folder, and prints how they ended.
 
-    A run with a real camera may also be ended by Ctrl-C. With `view` the run can be watched in a browser. `after` is
+    A run with a real camera may also be ended by Ctrl-C. With `view` the run can be watched in a browser. With `guide`
+    a page tells who holds the camera where to go; if this is left open, there is one if a hand moves it. `after` is
     called when the run is over, while the viewer is still there; a run that was interrupted has no viewer any more.
     Raises SaccadeError if the run cannot be started as it is configured, if the folder is not new, or if a service
     fails.
@@ -65,9 +67,13 @@ def run(config: Config, *, agent: str, out: Path | None, plain: bool, console: C
     require_weights(agent, config)
     if view:
         config = to_be_viewed(config)
+    guide = config.planner.moved_by == "hand" and config.bus.kind == "zenoh" if guide is None else guide
+    if guide:
+        config = to_be_guided(config)
     if config.ros.publish and config.bus.kind != "zenoh":
         raise SaccadeError("ros.publish is for services on the bus: leave `--bus local` out")
-    processes = agent_processes(agent, world, view=view, ros=config.ros.publish) if config.bus.kind == "zenoh" else ()
+    processes = agent_processes(agent, world, view=view, ros=config.ros.publish,
+                                guide=guide) if config.bus.kind == "zenoh" else ()
     folder = _new_folder(out or Path("runs") / f"{time.strftime('%Y%m%d-%H%M%S')}-{config.seed}")
     lacks: list[str] = []
     ended = None  # stays None if the run is interrupted: then no viewer stays
@@ -76,6 +82,8 @@ def run(config: Config, *, agent: str, out: Path | None, plain: bool, console: C
                      source=place.source, live=place.live) as display:
             if view:
                 display.say(f"look at {url_of(config.viewer)}")
+            if guide:
+                display.say(f"where to go next: {guide_url_of(config.viewer)}")
             try:
                 if processes:
                     ended = stack.enter_context(
@@ -106,6 +114,14 @@ def to_be_viewed(config: Config) -> Config:
     return with_free_ports(config)
 
 
+def to_be_guided(config: Config) -> Config:
+    """Returns the configuration with a free port for the page that guides a hand. Raises SaccadeError if the run cannot
+    have one."""
+    if config.bus.kind != "zenoh":
+        raise SaccadeError("--guide is for services on the bus: leave `--bus local` out")
+    return with_guide(config)
+
+
 def in_world(config: Config, world: str) -> Config:
     """Returns the configuration for that world. Raises SaccadeError if the world has no use for one of its keys, or if
     the camera's source cannot be used. This is checked before anything starts."""
@@ -117,8 +133,10 @@ def in_world(config: Config, world: str) -> Config:
     if scene.file or scene.scene or scene.n_objects or scene.count > 1:
         raise SaccadeError(f"scenes are the simulator's: in the world {world!r} give no scenes file, no scene, and no "
                            "number of objects or scenes")
+    mover = "hand" if camera.source is not None and is_live(camera.source) else None
     config = config.with_values({"scene.explore": scene.explore or scene.goal_image is None,
-                                 "bus.live": config.bus.kind == "zenoh"})
+                                 "bus.live": config.bus.kind == "zenoh",
+                                 "planner.moved_by": config.planner.moved_by or mover})
     from_outside = config.services.source is not None
     if not from_outside:
         require_one_of_each(camera)

@@ -41,6 +41,7 @@ class Process:
 
 VIEWER = Process("viewer", "saccade.services.viewer", onlooker=True)
 ROS = Process("ros", "saccade.services.ros", onlooker=True)
+GUIDE = Process("guide", "saccade.services.guide", onlooker=True)
 
 
 class Supervisor:

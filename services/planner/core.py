@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from saccade.services.planner.free_energy import Terms, expected_free_energy
 from saccade.services.planner.goal import Preference, aim, infer_preference
 from saccade.services.planner.goal_views import Side, nearest_eye
+from saccade.services.planner.hand import Hand
 from saccade.services.planner.motion import step_towards
 from saccade.shared.bus.messages import Action, Belief, Plan
 from saccade.shared.bus.topics import ACTION, BELIEF, GOAL_PERCEPT, PLAN, Output
@@ -68,7 +69,7 @@ class Planner:
 
     def __init__(self, config: Config, names: tuple[str, ...]):
         self.config, self.names, self.symmetry = config, names, symmetries(config.scene.objects, names)
-        self.moved_by_others = config.camera.source is not None
+        self.moved_by = config.planner.moved_by or ("recording" if config.camera.source is not None else "agent")
         self.sizes_m = {card.name: card.size_m for card in Weights(config.weights).cards_of(names)}
 
     def begin(self, run: str, episode: int) -> Iterable[Output]:
@@ -78,6 +79,7 @@ class Planner:
         self.plan: Plan | None = None  # as it was when it was chosen
         self.age = 0  # steps since the plan was chosen
         self.before: Array | None = None  # pose of the camera at the last step [4, 4]
+        self.hand = Hand(self.config.planner.replan_every) if self.moved_by == "hand" else None
         self.visited: list[Array] = []  # camera poses [4, 4] at which the agent has arrived in the mode "goal"
         return ()
 
@@ -95,22 +97,20 @@ class Planner:
             self.preference = preference if known and not self.config.scene.explore else None
         self._refine(beliefs)
         spheres = self.obstacles(beliefs)
-        chosen, declared = self.plan, False
-        arrived = chosen is not None and self._arrived(camera, chosen.viewpoint)
-        if chosen is not None and arrived and chosen.mode == "goal":
-            declared = beliefs[chosen.target].goal_here > SURE
-            if self.config.planner.retry:
-                self.visited.append(camera)
-        self.age += 1
-        mode = self._mode(beliefs)
-        if chosen is None or arrived or mode != chosen.mode or self.age >= self.config.planner.replan_every:
+        chosen, mode, eye = self.plan, self._mode(beliefs), self._believed_eye(beliefs, camera, spheres)
+        moved = self._moved if self.hand is None else self._followed
+        due, declared = moved(chosen, mode, beliefs, camera, eye)
+        if chosen is None or due:
             chosen = self.plan = self._choose(stamp, mode, beliefs, camera, spheres)
+            if self.hand is not None:
+                chosen = self.plan = replace(chosen, viewpoint=self.hand.follow(chosen.viewpoint, spheres, eye))
         self.before = camera
         heading = self._heading(camera, chosen, beliefs)
         translation, rotation = step_towards(camera, heading, spheres, self.config.planner.step_m)
         if declared:  # the agent is judged at the pose at which it says that it has arrived, so it must not move
             translation, rotation = np.zeros(3), np.zeros(3)
-        plan = self._published(chosen, stamp, camera, beliefs, spheres, declared)
+        distance = -1.0 if eye is None else float(np.linalg.norm(eye - camera[:3, 3]))
+        plan = replace(chosen, step=stamp.step, believed_distance_m=distance, arrived=declared)
         yield Output(PLAN, plan)
         yield Output(ACTION, Action(run=plan.run, episode=plan.episode, step=plan.step, translation_m=translation,
                                     rotation_rad=rotation, arrived=declared))
@@ -120,9 +120,34 @@ class Planner:
         if self.preference and beliefs[self.preference.target].goal_range_m > 0:
             self.preference = replace(self.preference, range_m=beliefs[self.preference.target].goal_range_m)
 
+    def _moved(self, chosen: Plan | None, mode: str, beliefs: dict[str, Belief], camera: Array,
+               eye: Array | None) -> tuple[bool, bool]:
+        """Whether the plan is to be renewed, and whether the agent says that it has arrived."""
+        arrived, declared = chosen is not None and self._arrived(camera, chosen.viewpoint), False
+        if chosen is not None and arrived and chosen.mode == "goal":
+            declared = beliefs[chosen.target].goal_here > SURE
+            if self.config.planner.retry:
+                self.visited.append(camera)
+        self.age += 1
+        due = chosen is None or arrived or mode != chosen.mode or self.age >= self.config.planner.replan_every
+        return due, declared
+
+    def _followed(self, chosen: Plan | None, mode: str, beliefs: dict[str, Belief], camera: Array,
+                  eye: Array | None) -> tuple[bool, bool]:
+        """The same for a hand, which `Hand` judges."""
+        if self.hand is None or chosen is None:
+            return True, False
+        if mode != chosen.mode and not self.hand.there:
+            return True, False
+        goal_here = beliefs[chosen.target].goal_here if chosen.mode == "goal" else None
+        verdict = self.hand.take(camera, goal_here, eye)
+        if verdict == "wrong" and self.config.planner.retry:
+            self.visited.append(camera)
+        return verdict in ("renew", "wrong"), verdict == "there"
+
     def _arrived(self, camera: Array, viewpoint: Array) -> bool:
         """Whether the camera is at the viewpoint, or as near as it can come."""
-        if self.moved_by_others:  # a person may pause anywhere and is not exact, so the task's tolerance counts
+        if self.moved_by == "recording":  # nobody follows the plan, so the task's tolerance counts
             return success(camera, viewpoint)
         moved = _between(camera, self.before) if self.before is not None and self.age > 1 else (1.0, 1.0)
         near = _between(camera, viewpoint)
@@ -243,6 +268,13 @@ class Planner:
         eye = _peak(target.mean_m, log_posterior, range_m)
         return nearest_eye(eye, target.mean_m, self.symmetry[target.object], camera, spheres)
 
+    def _believed_eye(self, beliefs: dict[str, Belief], camera: Array, spheres: Spheres) -> Array | None:
+        """Where the goal's view is believed to be [3]. None if nothing is known of it."""
+        target = beliefs[self.preference.target] if self.preference is not None else None
+        if self.preference is None or target is None or target.goal_log_posterior is None:
+            return None
+        return self._goal_eye(target, target.goal_log_posterior, self.preference.range_m, camera, spheres)
+
     def _goal_viewpoint(self, preference: Preference, target: Belief, eye: Array) -> Array:
         """The camera pose [4, 4] at `eye` [3] that shows the target at the pixel where the goal image shows it.
 
@@ -261,15 +293,6 @@ class Planner:
             g_information=float(terms.information[chosen]), candidates=len(terms.position), believed_distance_m=-1.0,
             goal_confidence=self.confidence,
             arrived=False)
-
-    def _published(self, plan: Plan, stamp: Belief, camera: Array, beliefs: dict[str, Belief], spheres: Spheres,
-                   declared: bool) -> Plan:
-        """The chosen plan with the step, the distance to the goal and the declaration of the present step."""
-        distance, target = -1.0, beliefs.get(plan.target)
-        if self.preference is not None and target is not None and target.goal_log_posterior is not None:
-            eye = self._goal_eye(target, target.goal_log_posterior, self.preference.range_m, camera, spheres)
-            distance = float(np.linalg.norm(eye - camera[:3, 3]))
-        return replace(plan, step=stamp.step, believed_distance_m=distance, arrived=declared)
 
 
 def _peak(center: Array, log_posterior: NDArray[np.float32], range_m: float) -> Array:

@@ -14,6 +14,7 @@ from typing import Any, Generic, TypeVar
 import rerun as rr
 
 from saccade.services.viewer.curves import Curves
+from saccade.services.viewer.guiding import Guiding
 from saccade.services.viewer.images import Images
 from saccade.services.viewer.imagination import Imagination
 from saccade.services.viewer.layout import STEP, Colour, colour_of, layout
@@ -68,6 +69,7 @@ class Viewer:
         sizes_m = {card.name: card.size_m for card in weights.cards} if weights else {}
         self._world = World(recording, self._colour_of, sizes_m)
         self._images = Images(recording, tuple(self._names), self._colour_of, imagination)
+        self._guiding = Guiding(recording) if config.planner.moved_by == "hand" else None
         self._curves = Curves(recording, tuple(self._names), self._colour_of)
         self._show: dict[Topic, Callable[[Any], None]] = {
             FRAME: self._frame, GOAL: self._images.goal, PERCEPT: self._percept, BELIEF: self._belief,
@@ -128,6 +130,8 @@ class Viewer:
             self._at(0)
             self._world.begin()
             self._images.begin()
+            if self._guiding is not None:
+                self._guiding.begin()
         if episode == self._episode:
             self._newest = max(self._newest, step)
             self._at(step)
@@ -147,6 +151,8 @@ class Viewer:
 
     def _frame(self, frame: Frame) -> None:
         self._world.frame(frame)
+        if self._guiding is not None:
+            self._guiding.frame(frame)
         if frame.step <= self._seen.step:  # when old messages are read, percepts may come before their frames
             self._images.frame(frame)
             return
@@ -197,6 +203,8 @@ class Viewer:
 
     def _plan(self, plan: Plan) -> None:
         self._world.plan(plan)
+        if self._guiding is not None:
+            self._guiding.plan(plan)
         self._images.plan(plan, self._believed)
         self._curves.plan(plan)
         self._say(decision(plan, self._believed.values()))

@@ -1,8 +1,8 @@
 """The door of the viewer: the two ports that others reach, in front of the two ports of Rerun's server.
 
-It reads the head of every request and refuses what may not pass (`admission.py`). Then it only forwards bytes. A page
-gets its data from the port that it came from, so a browser sends it the page's own cookie. The second port is for Rerun
-viewers that are not a browser.
+It reads the head of every request and refuses what may not pass (`shared/admission.py`). Then it only forwards bytes. A
+page gets its data from the port that it came from, so a browser sends it the page's own cookie. The second port is for
+Rerun viewers that are not a browser.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import threading
 from collections.abc import Awaitable, Callable
 from urllib.parse import quote
 
-from saccade.services.viewer.admission import Head, Rules, head_of
+from saccade.shared.admission import Head, Rules, head_of
 from saccade.shared.config import ViewerConfig
 from saccade.shared.errors import SaccadeError
 

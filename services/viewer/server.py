@@ -19,10 +19,10 @@ from importlib.util import find_spec
 from pathlib import Path
 from types import TracebackType
 
-from saccade.services.viewer.admission import with_token
 from saccade.services.viewer.door import Door
 from saccade.services.viewer.home import Home
 from saccade.services.viewer.priority import session_comes_last
+from saccade.shared.admission import with_token
 from saccade.shared.config import Config, ViewerConfig
 from saccade.shared.errors import SaccadeError
 
@@ -112,6 +112,11 @@ def url_of(config: ViewerConfig, *, token: bool = True) -> str:
     return f"{page}/?token={config.token}" if config.token and token else page
 
 
+def guide_url_of(config: ViewerConfig) -> str:
+    """The address of the page that guides a hand."""
+    return url_of(config.model_copy(update={"port": config.guide_port}))
+
+
 def own_address() -> str:
     """A loopback address for Rerun's server, which checks no Host and no Origin.
 
@@ -132,6 +137,16 @@ def with_free_ports(config: Config) -> Config:
     port = free_port(viewer.address, viewer.port, but=(viewer.data_port,))
     return config.with_values({"viewer.port": port, "viewer.token": with_token(viewer).token,
                                "viewer.data_port": viewer.data_port or free_port(viewer.address, but=(port,))})
+
+
+def with_guide(config: Config) -> Config:
+    """The configuration with a free port for the page that guides a hand. If other hosts reach it, it has a token.
+
+    Raises SaccadeError if no port is free.
+    """
+    viewer = config.viewer
+    port = free_port(viewer.address, viewer.guide_port, but=(viewer.port, viewer.data_port))
+    return config.with_values({"viewer.guide_port": port, "viewer.token": viewer.token or with_token(viewer).token})
 
 
 def binary() -> str:

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from saccade.services.viewer.layout import PATH, PLANNED, TABLE, TRUE, VIEW_PX, Colour, between
 from saccade.services.viewer.words import SEEN, plain
 from saccade.shared.bus.messages import Belief, Frame, Plan, Truth
-from saccade.shared.world.geometry import IMAGE_SIZE_PX, INTRINSICS_PX
+from saccade.shared.world.geometry import IMAGE_SIZE_PX, INTRINSICS_PX, quaternion
 from saccade.shared.world.task import LOWER_M, UPPER_M
 
 CAMERA, VIEWPOINT, GOAL, TRUTH = "world/camera", "world/viewpoint", "world/goal", "world/true"
@@ -111,11 +111,3 @@ class World:
         before = self._looks.get(path)
         self._looks[path] = look
         return before != look
-
-
-def quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The quaternion (x, y, z, w) of a rotation [3, 3]: the leading eigenvector of Bar-Itzhack's matrix (2000)."""
-    (a, b, c), (d, e, f), (g, h, i) = rotation
-    k = np.array([[a - e - i, d + b, g + c, h - f], [d + b, e - a - i, h + f, c - g],
-                  [g + c, h + f, i - a - e, d - b], [h - f, c - g, d - b, a + e + i]]) / 3
-    return np.linalg.eigh(k)[1][:, -1]

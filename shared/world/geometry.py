@@ -92,6 +92,22 @@ def rotation_angle(a: ArrayLike, b: ArrayLike) -> Array:
     return np.arccos(np.clip((trace - 1.0) / 2.0, -1.0, 1.0))
 
 
+def quaternion(rotation: ArrayLike) -> Array:
+    """The quaternion (x, y, z, w) of a rotation [3, 3]: the leading eigenvector of Bar-Itzhack's matrix (2000)."""
+    (a, b, c), (d, e, f), (g, h, i) = np.asarray(rotation, dtype=np.float64)
+    k = np.array([[a - e - i, d + b, g + c, h - f], [d + b, e - a - i, h + f, c - g],
+                  [g + c, h + f, i - a - e, d - b], [h - f, c - g, d - b, a + e + i]]) / 3
+    return np.linalg.eigh(k)[1][:, -1]
+
+
+def rotation_vector(rotation: ArrayLike) -> Array:
+    """The axis of a rotation [3, 3] times its angle in radians, which is at most pi: [3]."""
+    turned = quaternion(rotation)
+    axis, cosine = (turned[:3], turned[3]) if turned[3] >= 0 else (-turned[:3], -turned[3])
+    sine = float(np.linalg.norm(axis))
+    return axis * (2 * np.arctan2(sine, cosine) / max(sine, 1e-12))
+
+
 def pixel_rays(pixels: ArrayLike, intrinsics: ArrayLike) -> Array:
     """Unit rays [..., 3] in the camera's frame through the pixels (u, v) [..., 2]. `intrinsics` are (fx, fy, cx, cy) in
     pixels."""

@@ -1,4 +1,4 @@
-"""Who may use the viewer's ports: the Host, the Origin and the token of an HTTP request.
+"""Who may use the ports that a browser opens: the Host, the Origin and the token of an HTTP request.
 
 A page of another site must not read the run, not even under a name that its owner lets point to this machine (DNS
 rebinding). A browser cannot forge the headers Host and Origin, so they tell whose page asks. They tell nothing about a
