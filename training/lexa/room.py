@@ -14,7 +14,7 @@ from torch import Tensor
 from saccade.services.planner.lexa import ACTIONS, AROUND, GOING, IMAGE_PX, SCALE, Actor, small
 from saccade.services.simulator.core import Simulator
 from saccade.services.simulator.scenes import draw_goal, room_scenes, save_scenes
-from saccade.shared.bus.messages import Action, Frame
+from saccade.shared.bus.messages import Action, Frame, Goal
 from saccade.shared.bus.topics import Output
 from saccade.shared.render.objects import load_mesh
 from saccade.shared.render.world import World
@@ -70,7 +70,9 @@ class Room:
         scene = replace(self.scene, target=target, goal_world_from_camera=goal)
         simulator = Simulator(self.world, [scene], max_steps=steps)
         begun = simulator.begin("measure", 0)
-        act, image, nearest = act_for(begun[0].message.rgb), _image(begun), np.inf  # type: ignore[union-attr]  # a Goal
+        shown, = (output.message.rgb for output in begun if isinstance(output.message, Goal))
+        assert shown is not None  # who measures does not explore
+        act, image, nearest = act_for(shown), _image(begun), np.inf
         while True:
             outputs = _moved(simulator, act(image))
             camera = simulator.state.camera
