@@ -2,6 +2,7 @@
 
 import io
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,8 +11,7 @@ from rich.console import Console
 
 from saccade.app.cli.texts import configured
 from saccade.app.run.run import run
-from saccade.services.planner.lexa import Actor, StateSpaceModel, likeliest
-from saccade.services.simulator.gym_env import ActiveSearch
+from saccade.services.planner.lexa import SCALE, Actor, StateSpaceModel, likeliest
 from saccade.services.simulator.scenes import room_scenes
 from saccade.shared.bus.messages import Action, Frame
 from saccade.shared.bus.topics import STATUS
@@ -19,12 +19,14 @@ from saccade.shared.errors import SaccadeError
 from saccade.shared.log.reading import RunReader
 from saccade.shared.model.weights import MANIFEST, Weights
 from saccade.shared.render.objects import load_mesh
+from saccade.shared.world.task import apply_action, start_pose
 from saccade.tests.fakes.logs import assert_replayed
 from saccade.tests.fakes.training import assert_same_checkpoint, interrupt_and_resume
 from saccade.tests.fakes.weights import write_random_weights
+from saccade.training.lexa import room, task
 from saccade.training.lexa.behaviour import achiever_loss, explorer_loss, returns
 from saccade.training.lexa.replay import Episode, Replay
-from saccade.training.lexa.world_model import Learner, distance_loss, divergence, observe
+from saccade.training.lexa.world_model import Learner, distance_loss, distance_of, divergence, observe, patched
 from saccade.training.part import Trainer
 from saccade.training.run import export, start
 from saccade.training.settings import TrainingConfig
@@ -32,18 +34,24 @@ from saccade.training.settings import TrainingConfig
 NAMES = ("soup_can", "rice_box")
 EPISODE = {"scene.names": list(NAMES), "scene.n_objects": 2, "simulator.max_steps": 4, "seed": 4}
 TINY = TrainingConfig(objects="pantry", names=NAMES, steps_extraction=4, batch_extraction=2, checkpoint_every=2,
-                      device="cpu", architecture="lexa")
+                      device="cpu", architecture="lexa", live_every=1)
+SHORT_LIFE = {"EPISODE": 30, "FIRST": 2, "BLIND": 2, "BEHAVE_FROM": 1, "MEASURED": 2, "MEASURED_STEPS": 3}
 CPU = torch.device("cpu")
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
-    """Two tiny runs, one of them interrupted after its first checkpoint."""
+    """Two tiny runs, one of them interrupted after its first checkpoint. Their lives are short: an episode by chance,
+    the explorer's, and the achiever's."""
     folder = tmp_path_factory.mktemp("runs")
     for name in ("whole", "resumed"):
         start(folder / name, TINY)
-    Trainer(folder / "whole", "lexa").train()
-    interrupt_and_resume(folder / "resumed", "lexa", before_step=3)
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in SHORT_LIFE.items():
+            patch.setattr(task, name, value)
+        patch.setattr(room, "GOING", 20)
+        Trainer(folder / "whole", "lexa").train()
+        interrupt_and_resume(folder / "resumed", "lexa", before_step=3)
     export(folder / "whole", folder / "weights")
     return folder
 
@@ -53,28 +61,60 @@ def test_training_continues_as_if_it_had_not_been_interrupted(finished):
     weights = Weights(finished / "weights")
     assert (weights.architecture, weights.names) == ("lexa", NAMES)
     weights.fill(Actor(), "lexa")  # what only training needs is not in them
-    assert json.loads((finished / "weights" / MANIFEST).read_text())["losses"]["lexa"]["environment_steps"] >= 400
+    measured = json.loads((finished / "weights" / MANIFEST).read_text())["losses"]["lexa"]
+    assert measured["environment_steps"] == 30 * 6  # two episodes before the first step of learning, then one a step
+    assert measured["nearest"] > 0.0
+    assert measured["reached"] in (0.0, 0.5, 1.0)
 
 
-def test_the_goals_of_the_suite_are_not_lived_in(finished):
-    """The environment has the suite's room; its episodes' images show all objects, and no goal is among them."""
+def test_the_goals_of_the_suite_are_neither_lived_in_nor_measured_on(tmp_path):
+    """The room is the suite's. No goal ends an episode, not even the suite's first, which is 20 steps away here."""
     sizes = {name: load_mesh("pantry", name).size_m for name in NAMES}
-    room = room_scenes(sizes)
-    assert len(room) == 2 * 20
-    kept = json.loads((finished / "whole" / "lexa" / "room.json").read_text())["scenes"]
-    assert [scene["id"] for scene in kept] == [room[0].id]
-    with ActiveSearch(objects="pantry", names=NAMES, size_px=64) as environment:
-        assert environment.reset(seed=1)[0]["image"].shape == (64, 64, 3)
+    suite = room_scenes(sizes)
+    home = room.Room("pantry", NAMES, tmp_path, 25)
+    assert [p.center_m.tolist() for p in home.scene.objects] == [p.center_m.tolist() for p in suite[0].objects]
+    assert home.scene.table_rgb == suite[0].table_rgb
+    home.scene = replace(home.scene, goal_world_from_camera=start_pose())  # stood on in every step
+    episode = home.live(lambda _image: np.zeros(6))
+    assert (episode.images.shape, episode.actions.shape) == ((26, 32, 32, 3), (25, 6))
+    assert np.array_equal(episode.images[0], episode.images[-1])
+    known = [scene.goal_world_from_camera for scene in suite]
+    measured = [home.goal(number)[1] for number in range(task.MEASURED)]
+    assert not any(np.allclose(one, other) for one in measured for other in known)
+
+
+def test_a_goal_of_the_measure_is_reached_by_who_goes_there(tmp_path):
+    home = room.Room("pantry", NAMES, tmp_path, 25)
+    goal = home.goal(1)[1]
+
+    def straight(image):
+        pose = [start_pose()]
+
+        def act(_image):
+            turn = goal[:3, :3] @ pose[0][:3, :3].T
+            angle = np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))
+            axis = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+            axis = axis / max(np.linalg.norm(axis), 1e-9)
+            move = np.r_[goal[:3, 3] - pose[0][:3, 3], angle * axis] / np.array(SCALE)
+            move = move / max(1.0, np.abs(move).max())
+            pose[0] = apply_action(pose[0], move[:3] * SCALE[0], move[3:] * SCALE[3])
+            return move
+
+        return act
+
+    assert home.reach(1, 60, straight) < 1.0 < home.reach(1, 60, lambda _goal: lambda _image: np.zeros(6))
 
 
 def test_an_episode_that_ended_early_is_kept_and_not_learnt_from(tmp_path):
     replay, rng = Replay(tmp_path, 0), np.random.default_rng(0)
     for length, shade in ((3, 0), (6, 200)):
-        replay.add(Episode(np.full((length + 1, 64, 64, 3), shade, np.uint8), np.full((length, 6), 0.5, np.float32)))
+        replay.add(Episode(np.full((length + 1, 32, 32, 3), shade, np.uint8), np.full((length, 6), 0.5, np.float32)))
     drawn = Replay(tmp_path, 2).sequences(8, 5, rng, CPU)
     assert drawn.images.unique().tolist() == [pytest.approx(200 / 255)]
     assert drawn.actions.shape == (8, 5, 6)
     assert set(drawn.actions[:, 0].unique().tolist()) == {0.0, 0.5}  # before the first image of an episode: none
+    assert torch.equal(drawn.travelled[:, 1:], drawn.travelled[:, :1] + drawn.actions[:, 1:].cumsum(1))
+    assert set(drawn.travelled[:, 0].unique().tolist()) == {0.0, 0.5, 1.0}  # since the episode's start
     (tmp_path / "00001.npz").write_bytes(b"no episode")
     with pytest.raises(SaccadeError, match=r"00001.npz is missing or damaged"):
         Replay(tmp_path, 2)
@@ -97,27 +137,43 @@ def test_policies_learn_and_the_world_model_does_not_learn_from_them():
     assert float(divergence(posterior, prior).detach().min()) > 0.0
     begin = type(states)(*(part.detach().flatten(0, 1) for part in states))
     explorer_loss(learner, begin, generator)[0].backward()
-    achiever_loss(learner, begin, torch.randn(12, 256), generator)[0].backward()
+    achiever_loss(learner, begin, torch.randn(12, 32), generator)[0].backward()
     learnt = {name.split(".")[0] if not name.startswith("actor.") else name.split(".")[1]
               for name, value in learner.named_parameters() if value.grad is not None and value.grad.abs().sum() > 0}
-    assert learnt == {"explorer", "achiever", "worth_explored", "worth_achieved"}
+    assert learnt == {"explorer", "achiever", "worth_explored"}
 
 
-def test_the_distance_learns_how_far_apart_images_are():
-    """On encodings that say where in their sequence they are, and in which one."""
+def test_the_distance_is_that_of_the_way_without_its_detours():
+    """Of states and images that say where they are: the distance becomes that between them, also over episodes."""
     torch.manual_seed(0)
-    learner, generator = Learner(), torch.Generator().manual_seed(0)
-    encodings = torch.zeros(4, 9, 256)
-    encodings[:, :, 0], encodings[:, :, 1] = torch.arange(4)[:, None], torch.linspace(0, 4, 9)
-    optimizer = torch.optim.Adam(learner.distance.parameters(), lr=2e-3)
+    travelled = (2 * torch.rand(40, 6) - 1).cumsum(0)
+    known = torch.cat([travelled, torch.zeros(40, 250)], -1)
+    learner = Learner()
+    aim, place = learner.actor.aim, learner.actor.place
+    optimizer = torch.optim.Adam([*aim.parameters(), *place.parameters()], lr=2e-3)
     losses = []
-    for _ in range(150):
-        loss = distance_loss(learner, encodings, generator)
+    for _ in range(200):
+        loss = distance_loss(place(torch.cat([known, torch.zeros(40, 200)], -1)), aim(known), travelled, travelled)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
         losses.append(float(loss.detach()))
-    assert np.mean(losses[-10:]) < 0.3 * losses[0]
+    assert losses[-1] < 0.1 * losses[0]
+    found = distance_of(aim(known), aim(known), all_pairs=True).detach()
+    assert np.corrcoef(found.flatten(), torch.cdist(travelled, travelled).flatten())[0, 1] > 0.9
+    assert distance_of(aim(known[:9]), aim(known[9:18])).tolist() == pytest.approx(
+        found[:9, 9:18].diagonal().tolist(), rel=1e-2)
+
+
+def test_parts_of_images_are_painted_over_with_their_commonest_colour():
+    images = torch.full((64, 3, 32, 32), 0.25)
+    images[:, :, 4:12, 4:12] = 0.75
+    seen = patched(images, torch.Generator().manual_seed(0))
+    assert set(seen.unique().tolist()) == {0.25, 0.75}
+    left = (seen == 0.75).flatten(1).float().mean(1)
+    whole = 64 / 1024
+    assert float(left.max()) == whole
+    assert 0.0 < float((left < whole).float().mean()) < 0.6
 
 
 def test_the_state_is_a_fold_over_images_and_actions():

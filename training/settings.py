@@ -22,8 +22,9 @@ PAPER = {"steps_ccn": 5_000, "steps_extraction": 6_000, "batch_ccn": 150, "batch
 
 # The defaults of PoseCNN. It has one network for all objects, which counts as phase 2.
 POSECNN = {"steps_extraction": 8_000, "batch_extraction": 16, "rate_extraction": 1e-3}
-# The defaults of LEXA: a batch is pieces of 25 images.
-LEXA = {"steps_extraction": 20_000, "batch_extraction": 16, "rate_extraction": 2e-4}
+# The defaults of LEXA: a batch is pieces of 16 images.
+LEXA = {"steps_extraction": 9_000, "batch_extraction": 18, "rate_extraction": 1e-3, "live_every": 12,
+        "checkpoint_every": 1_000}
 # The defaults of the networks that know no object by name. The proposer counts as phase 2, the two others as phase 1.
 OPEN = {"views": 400, "steps_ccn": 6_000, "steps_extraction": 4_000, "batch_ccn": 80, "batch_extraction": 16,
         "rate_ccn": 1.2e-3, "rate_extraction": 1.5e-3}
@@ -47,7 +48,7 @@ class TrainingConfig(Section):
 
     With "posecnn" there is one network. `symmetric` are the objects whose rotation has the loss for symmetric objects.
 
-    With "lexa" an episode of 50 steps is lived through every `live_every` steps of learning.
+    With "lexa" an episode of 100 steps is lived through every `live_every` steps of learning.
 
     With "open" there are three networks that know no object, and a bank of views for each object of the set. They are
     trained on the set's objects, on the meshes in the folders `scans` (each in a folder of its own), but for those that

@@ -8,7 +8,6 @@ acts on this state. `training/lexa` trains it in one room. The weights' manifest
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -22,16 +21,20 @@ from saccade.shared.bus.messages import Frame, Goal
 from saccade.shared.bus.topics import ACTION, FRAME, GOAL, PLAN, Output
 from saccade.shared.config import Config
 from saccade.shared.errors import SaccadeError
+from saccade.shared.loop.seeding import generator
 from saccade.shared.loop.service import Inputs, Service
 from saccade.shared.model.weights import Weights
 
 SERVICE = Service("planner", inputs=(FRAME, GOAL), trigger=FRAME, outputs=(PLAN, ACTION))
 
-IMAGE_PX = 64
+IMAGE_PX = 32
 EMBEDDED, DETERMINISTIC, GROUPS, CLASSES = 256, 200, 16, 16
 FEATURE = DETERMINISTIC + GROUPS * CLASSES
+PLACE = 32  # numbers of a place in the map of distances
 ACTIONS = 6
-SCALE = (0.08, 0.08, 0.08, 0.15, 0.15, 0.15)  # an action of 1 in metres and radians
+SCALE = (0.06, 0.06, 0.06, 0.1, 0.1, 0.1)  # an action of 1 in metres and radians
+GOING, AROUND = 30, 20  # steps towards a goal, and then by chance around it, again and again
+BEND = 1.5  # the mean of an action is bent to stay within this, where the gradient of tanh has not vanished
 UNIFORM = 0.01  # share of a uniform distribution in every categorical one
 
 
@@ -49,15 +52,12 @@ class State(NamedTuple):
 
 
 class ImageEncoder(nn.Module):
-    """Images [B, 3, 64, 64] (0 to 1) -> encodings [B, 256]."""
+    """Images [B, 3, 32, 32] (0 to 1) -> encodings [B, 256]."""
 
     def __init__(self) -> None:
         super().__init__()
-        widths = (3, 16, 32, 64, 128)
-        layers: list[nn.Module] = []
-        for before, after in pairwise(widths):
-            layers += [nn.Conv2d(before, after, 4, 2, padding=1), nn.SiLU()]
-        self.layers = nn.Sequential(*layers, nn.Flatten(), nn.Linear(128 * 16, EMBEDDED), nn.LayerNorm(EMBEDDED))
+        self.layers = nn.Sequential(nn.Conv2d(3, 64, 6, 4, padding=1), nn.SiLU(), nn.Conv2d(64, 128, 3, 2, padding=1),
+                                    nn.SiLU(), nn.Flatten(), nn.Linear(128 * 16, EMBEDDED), nn.LayerNorm(EMBEDDED))
 
     def forward(self, image: Tensor) -> Tensor:
         return self.layers(image - 0.5)
@@ -116,25 +116,37 @@ class Policy(nn.Module):
 
     def forward(self, feature: Tensor) -> tuple[Tensor, Tensor]:
         mean, raw = self.layers(feature).float().chunk(2, dim=-1)
-        return 3.0 * torch.tanh(mean / 3.0), F.softplus(raw) + 0.1
+        return BEND * torch.tanh(mean / BEND), F.softplus(raw) + 0.1
 
 
 class Actor(nn.Module):
-    """What acts: the encoder, the model and the achiever."""
+    """What acts: the encoder, the model, the achiever, and the map of distances, in which `place` says where a state
+    is and `aim` where a goal image is. The distance of two places [32] is the number of full steps between them."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.encoder, self.model, self.achiever = ImageEncoder(), StateSpaceModel(), Policy(FEATURE + EMBEDDED)
+        self.encoder, self.model = ImageEncoder(), StateSpaceModel()
+        self.place, self.aim = perceptron(FEATURE, PLACE), perceptron(EMBEDDED, PLACE)
+        self.achiever = Policy(FEATURE + 2 * PLACE)
 
     def fold(self, state: State, action: Tensor, image: Tensor, pick: Callable[[Tensor], Tensor]) -> State:
-        """The state after an action [B, 6] and the image [B, 3, 64, 64] that followed. `pick` chooses the sample from
+        """The state after an action [B, 6] and the image [B, 3, 32, 32] that followed. `pick` chooses the sample from
         the log probabilities of the posterior."""
         deterministic, _ = self.model(state, action)
         return State(deterministic, pick(self.model.observe(deterministic, self.encoder(image))))
 
+    def towards(self, state: State, aim: Tensor) -> tuple[Tensor, Tensor]:
+        """What `Policy` says for the way from a state to an aim [B, 32]."""
+        return self.achiever(wish(state.feature, self.place(state.feature), aim))
+
+
+def wish(feature: Tensor, place: Tensor, aim: Tensor) -> Tensor:
+    """What the achiever is given [..., 520]: the feature, its place and the aim [..., 32], seen from the place."""
+    return torch.cat([feature, aim, aim - place], dim=-1)
+
 
 def small(rgb: NDArray[np.uint8]) -> Tensor:
-    """An image [H, W, 3] as the network sees it [1, 3, 64, 64]."""
+    """An image [H, W, 3] as the network sees it [1, 3, 32, 32]."""
     image = torch.from_numpy(np.array(rgb)).permute(2, 0, 1)[None].float() / 255.0
     return F.interpolate(image, size=(IMAGE_PX, IMAGE_PX), mode="area")
 
@@ -152,29 +164,41 @@ class Lexa:
                                "agent needs 'lexa': name other weights, or choose the agent that works with these")
         actor = weights.fill(Actor(), "lexa")
         assert isinstance(actor, Actor)  # it is what was filled
-        self.actor = actor
+        self.actor, self.config = actor, config
 
     def begin(self, run: str, episode: int) -> Iterable[Output]:
         """Starts an episode with a new goal. Nothing is published."""
+        self.episode = episode
         self.state = self.actor.model.initial(1)
         self.action = torch.zeros(1, ACTIONS)
-        self.goal: Tensor | None = None  # its encoding [1, 256]
+        self.goal: Tensor | None = None  # its place in the map of distances [1, 32]
         return ()
 
     @torch.inference_mode()
     def step(self, inputs: Inputs) -> Iterable[Output]:
-        """Yields a plan and an action, from the images so far. Without a goal image the camera stands still."""
+        """Yields a plan and an action, from the images so far. Without a goal image the camera stands still.
+
+        The map of distances is wrong by some centimetres. So the camera does not rest where it has arrived: it looks
+        around there by chance, and goes there again.
+        """
         frame: Frame = inputs["frame"]
         goal: Goal = inputs["goal"]
         if goal.rgb is None:
             return step_from(frame, (np.zeros(3), np.zeros(3)))
         if self.goal is None:
-            self.goal = self.actor.encoder(small(goal.rgb))
+            self.goal = self.actor.aim(self.actor.encoder(small(goal.rgb)))
         self.state = self.actor.fold(self.state, self.action, small(frame.rgb), likeliest)
-        mean, _ = self.actor.achiever(torch.cat([self.state.feature, self.goal], dim=-1))
-        self.action = torch.tanh(mean)
+        self.action = self._action(frame.step)
         move = self.action[0].double().numpy() * SCALE
         return step_from(frame, (move[:3], move[3:]))
+
+    def _action(self, step: int) -> Tensor:
+        chance = generator(self.config.seed, self.config.bus.world, self.episode, step, "planner")
+        if step % (GOING + AROUND) >= GOING:
+            return torch.from_numpy(chance.uniform(-1, 1, (1, ACTIONS)).astype(np.float32))
+        assert self.goal is not None
+        mean, std = self.actor.towards(self.state, self.goal)
+        return torch.tanh(mean + std * torch.from_numpy(chance.normal(size=(1, ACTIONS)).astype(np.float32)))
 
 
 def build(config: Config) -> Lexa:

@@ -10,12 +10,13 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.func import functional_call
 
-from saccade.services.planner.lexa import Policy, State
+from saccade.services.planner.lexa import Policy, State, wish
 from saccade.training.lexa.world_model import Learner, distance_of, sampled
 
-HORIZON = 12
+HORIZON = 5
 DISCOUNT, LAMBDA = 0.95, 0.95
 ENTROPY = 1e-3
+EFFORT = 0.05  # of the achiever's actions, so that it makes none that brings nothing, such as into a wall
 
 
 class Imagined(NamedTuple):
@@ -90,16 +91,16 @@ def explorer_loss(learner: Learner, start: State, generator: torch.Generator) ->
     return policy + critic, {"disagreement": rewards.mean()}
 
 
-def achiever_loss(learner: Learner, start: State, goals: Tensor,
+def achiever_loss(learner: Learner, start: State, aims: Tensor,
                   generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
-    """The achiever comes near, in temporal distance, to goals [B, 256] that were seen."""
-    policy_of = learner.actor.achiever
+    """The achiever comes nearer to what was seen, whose aims [B, 32] are given: its loss is the distance after each
+    step. The distance counts the steps that are left, so there is no critic, and a short way is enough to learn from.
+    """
+    place = Frozen(learner.actor.place)
     imagined = imagine(
         learner, start,
-        lambda feature: squashed(policy_of, torch.cat([feature, goals], dim=-1), generator), generator)
-    wanted = goals.expand(len(imagined.features), -1, -1)
-    encodings = Frozen(learner.encoding)(imagined.features[1:]).float()
-    rewards = -distance_of(Frozen(learner.distance), torch.cat([encodings, wanted[1:]], dim=-1))  # type: ignore[arg-type]  # a network but for its class
-    policy, critic = policy_loss(imagined, rewards, learner.worth_achieved,
-                                 torch.cat([imagined.features, wanted], dim=-1))
-    return policy + critic, {"distance": -rewards.mean()}
+        lambda feature: squashed(learner.actor.achiever, wish(feature, place(feature), aims), generator), generator)
+    distance = distance_of(place(imagined.features).float(), aims.expand(HORIZON + 1, -1, -1))
+    effort = imagined.actions.square().sum(-1).mean()
+    policy = distance[1:].mean() + EFFORT * effort - ENTROPY * imagined.entropy.mean()
+    return policy, {"distance": distance[0].mean(), "nearer": (distance[0] - distance[-1]).mean()}

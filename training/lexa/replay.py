@@ -15,17 +15,19 @@ from saccade.shared.files import writing
 
 
 class Episode(NamedTuple):
-    """Images [T + 1, 64, 64, 3] uint8, and the actions [T, 6] between them, each from -1 to 1."""
+    """Images [T + 1, 32, 32, 3] uint8, and the actions [T, 6] between them, each from -1 to 1."""
 
     images: NDArray[np.uint8]
     actions: NDArray[np.float32]
 
 
 class Sequences(NamedTuple):
-    """B pieces of episodes: images [B, L, 3, 64, 64] (0 to 1), and the action before each image [B, L, 6]."""
+    """B pieces of episodes: images [B, L, 3, 32, 32] (0 to 1), the action before each image [B, L, 6], and the sum of
+    the actions from the episode's first image on [B, L, 6]."""
 
     images: Tensor
     actions: Tensor
+    travelled: Tensor
 
 
 class Replay:
@@ -62,7 +64,7 @@ class Replay:
 
     def sequences(self, count: int, length: int, rng: np.random.Generator, device: torch.device) -> Sequences:
         """Draws pieces of `length` images from random places of random episodes that are as long."""
-        images, actions = [], []
+        images, actions, travelled = [], [], []
         long = [episode for episode in self.episodes if len(episode.images) >= length]
         for _ in range(count):
             episode = long[int(rng.integers(len(long)))]
@@ -70,11 +72,19 @@ class Replay:
             images.append(episode.images[start:start + length])
             before = np.concatenate([np.zeros((1, episode.actions.shape[1]), np.float32), episode.actions])
             actions.append(before[start:start + length])
+            travelled.append(before.cumsum(0)[start:start + length])
         stacked = torch.from_numpy(np.stack(images)).to(device)
         return Sequences(stacked.permute(0, 1, 4, 2, 3).float() / 255.0,
-                         torch.from_numpy(np.stack(actions)).to(device))
+                         *(torch.from_numpy(np.stack(each)).to(device) for each in (actions, travelled)))
 
-    def goal(self, rng: np.random.Generator) -> NDArray[np.uint8]:
-        """Draws an image [64, 64, 3] that was seen."""
-        episode = self.episodes[int(rng.integers(len(self.episodes)))]
-        return episode.images[int(rng.integers(len(episode.images)))]
+    def views(self, count: int, rng: np.random.Generator, device: torch.device) -> tuple[Tensor, Tensor]:
+        """Draws images [count, 3, 32, 32] (0 to 1) that were seen, and the sums of the actions before them [count, 6].
+        """
+        images, travelled = [], []
+        for number in rng.integers(len(self.episodes), size=count):
+            episode = self.episodes[number]
+            at = int(rng.integers(len(episode.images)))
+            images.append(episode.images[at])
+            travelled.append(episode.actions[:at].sum(0))
+        stacked = torch.from_numpy(np.stack(images)).to(device)
+        return stacked.permute(0, 3, 1, 2).float() / 255.0, torch.from_numpy(np.stack(travelled)).to(device)

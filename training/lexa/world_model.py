@@ -20,19 +20,23 @@ from saccade.services.planner.lexa import (
 from saccade.training.lexa.replay import Sequences
 
 ENSEMBLE = 5  # predictors whose disagreement is the explorer's reward
+NEAR = 1e-3  # of a squared distance, so that its root has a gradient at 0
+SLACK = 0.2  # a long distance may be wrong by this share of it as much as a short one by a step
+SHORT = 0.3  # what a distance that is too short costs, where one that is too long costs 1
+NEARBY = 5.0  # full steps from which on a distance counts less
+DRAWN = 6  # images of each piece that are decoded
+PRECISION = 25.0  # of the decoded images: one over the variance of a pixel's colour
 PRIOR_SHARE, POSTERIOR_SHARE, FREE_NATS = 0.5, 0.1, 1.0  # of the KL divergence (Hafner et al., 2023)
 
 
 class ImageDecoder(nn.Module):
-    """Features [B, 456] -> images [B, 3, 64, 64]."""
+    """Features [B, 456] -> images [B, 3, 32, 32]."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.start = nn.Sequential(nn.Linear(FEATURE, 128 * 16), nn.SiLU(), nn.Unflatten(1, (128, 4, 4)))
-        layers: list[nn.Module] = []
-        for before, after in ((128, 64), (64, 32), (32, 16)):  # pixel shuffles are faster than transposed convolutions
-            layers += [nn.Conv2d(before, 4 * after, 3, padding=1), nn.PixelShuffle(2), nn.SiLU()]
-        self.layers = nn.Sequential(*layers, nn.Conv2d(16, 12, 3, padding=1), nn.PixelShuffle(2))
+        self.start = nn.Sequential(nn.Linear(FEATURE, 48 * 64), nn.SiLU(), nn.Unflatten(1, (48, 8, 8)))
+        self.layers = nn.Sequential(nn.Conv2d(48, 48, 3, padding=1), nn.SiLU(), nn.Conv2d(48, 48, 3, padding=1),
+                                    nn.PixelShuffle(4))  # a pixel shuffle is faster than transposed convolutions
 
     def forward(self, feature: Tensor) -> Tensor:
         return self.layers(self.start(feature)).float() + 0.5
@@ -40,16 +44,15 @@ class ImageDecoder(nn.Module):
 
 class Learner(nn.Module):
     """All networks of a training run: those that act, and the decoder, the encoding's prediction, the ensemble, the
-    distance, the explorer and two critics."""
+    explorer and its critic."""
 
     def __init__(self) -> None:
         super().__init__()
         self.actor, self.decoder = Actor(), ImageDecoder()
         self.encoding = perceptron(FEATURE, EMBEDDED)
         self.ensemble = nn.ModuleList(perceptron(FEATURE + ACTIONS, EMBEDDED) for _ in range(ENSEMBLE))
-        self.distance = perceptron(2 * EMBEDDED, 1)
         self.explorer = Policy(FEATURE)
-        self.worth_explored, self.worth_achieved = perceptron(FEATURE, 1), perceptron(FEATURE + EMBEDDED, 1)
+        self.worth_explored = perceptron(FEATURE, 1)
 
 
 def sampled(log_shares: Tensor, generator: torch.Generator) -> Tensor:
@@ -58,6 +61,26 @@ def sampled(log_shares: Tensor, generator: torch.Generator) -> Tensor:
     uniform = torch.rand(shares.shape, generator=generator, device=shares.device)
     drawn = (log_shares.detach() - (-uniform.clamp(min=1e-20).log()).log()).argmax(-1)  # the Gumbel-max trick
     return (F.one_hot(drawn, CLASSES) + shares - shares.detach()).flatten(-2)
+
+
+def patched(images: Tensor, generator: torch.Generator) -> Tensor:
+    """Half of the images [B, 3, S, S], each with up to two rectangles painted over with its commonest colour.
+
+    A goal image may show less than the room has in it. So an aim must not depend on every part of an image.
+    """
+    count, side = len(images), images.shape[-1]
+    along = torch.arange(side, device=images.device)
+    pixels = images.flatten(2)
+    plain = pixels.median(-1).values[:, :, None, None]
+    result = images
+    for _ in range(2):
+        drawn = torch.rand(5, count, 1, generator=generator, device=images.device)
+        first, extent = drawn[:2] * 1.4 * side - 0.4 * side, (0.15 + 0.6 * drawn[2:4]) * side
+        down, across = ((along >= begin) & (along < begin + length) for begin, length in zip(first, extent,
+                                                                                             strict=True))
+        cut = (down[:, :, None] & across[:, None, :] & (drawn[4] < 0.3)[:, :, None])[:, None]
+        result = torch.where(cut, plain, result)
+    return result
 
 
 def observe(model: StateSpaceModel, encodings: Tensor, actions: Tensor,
@@ -88,13 +111,16 @@ def divergence(posterior: Tensor, prior: Tensor) -> Tensor:
 
 
 def model_loss(learner: Learner, batch: Sequences, encodings: Tensor, states: State, posterior: Tensor,
-               prior: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-    """The loss of the world model and its parts: the image's error, the KL terms, and the encoding's error."""
-    features = states.feature.flatten(0, 1)
-    image = 0.5 * ((learner.decoder(features) - batch.images.flatten(0, 1)) ** 2).sum((1, 2, 3)).mean()
+               prior: Tensor, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
+    """The loss of the world model and its parts: the error of some images, the KL terms, and the encoding's error."""
+    count, length = encodings.shape[:2]
+    chosen = torch.rand(count, length, generator=generator, device=encodings.device).argsort(1)[:, :DRAWN]
+    rows = torch.arange(count, device=encodings.device)[:, None]
+    drawn = learner.decoder(states.feature[rows, chosen].flatten(0, 1))
+    image = 0.5 * PRECISION * (drawn - batch.images[rows, chosen].flatten(0, 1)).square().sum((1, 2, 3)).mean()
     forward = divergence(posterior.detach(), prior).clamp(min=FREE_NATS).mean()
     backward = divergence(posterior, prior.detach()).clamp(min=FREE_NATS).mean()
-    encoding = F.mse_loss(learner.encoding(features.detach()).float(), encodings.detach().flatten(0, 1).float())
+    encoding = F.mse_loss(learner.encoding(states.feature.detach()).float(), encodings.detach())
     loss = image + PRIOR_SHARE * forward + POSTERIOR_SHARE * backward + encoding
     return loss, {"image": image, "kl": forward, "encoding": encoding}
 
@@ -106,24 +132,29 @@ def ensemble_loss(learner: Learner, states: State, actions: Tensor, encodings: T
     return torch.stack([F.mse_loss(member(inputs).float(), target) for member in learner.ensemble]).sum()
 
 
-def distance_loss(learner: Learner, encodings: Tensor, generator: torch.Generator) -> Tensor:
-    """The error of the temporal distance: the share of a sequence's length between two of its images, in either order;
-    1 between images of different sequences."""
-    known = encodings.detach()
-    count, length = known.shape[:2]
+def distance_loss(places: Tensor, aims: Tensor, travelled: Tensor, aimed: Tensor) -> Tensor:
+    """The error of the distances from places of states and from aims of images to these aims.
 
-    def drawn() -> Tensor:
-        return torch.randint(length, (count, length), generator=generator, device=known.device)
+    Two images are as far apart as the sum of the actions between them is long: a detour does not count. Between two
+    episodes the way leads over the start, which they share. Where something held the camera up, the sum is too long; so
+    a distance that is shorter than it costs less than one that is longer, and long ways count less than short ones.
+    `travelled` [N, 6] and `aimed` [M, 6] are the sums of the actions since the episode's start for places [N, 32] and
+    aims [M, 32].
+    """
+    loss = torch.zeros((), device=places.device)
+    for here, steps in ((places, travelled), (aims, aimed)):
+        true = torch.cdist(steps, aimed)
+        error = (distance_of(here, aims, all_pairs=True) - true) / (1 + SLACK * true)
+        costs = F.smooth_l1_loss(error, torch.zeros_like(error), reduction="none", beta=0.5)
+        weights = torch.where(error > 0, 1.0, SHORT) / (1 + true / NEARBY)
+        loss = loss + (weights * costs).sum() / weights.sum().detach()
+    return loss
 
-    first, second = drawn(), drawn()
-    rows = torch.arange(count, device=known.device)[:, None]
-    near = (first - second).abs() / (length - 1)
-    pairs = [torch.cat([known[rows, first], known[rows, second]], -1),
-             torch.cat([known[rows, first], known.roll(1, 0)[rows, second]], -1)]
-    return sum((F.mse_loss(distance_of(learner.distance, pair), target)
-                for pair, target in zip(pairs, (near, torch.ones_like(near)), strict=True)), torch.zeros(()))
 
-
-def distance_of(network: nn.Module, pairs: Tensor) -> Tensor:
-    """The temporal distance [...] of pairs of encodings [..., 512], from 0 to about 1."""
-    return F.softplus(network(pairs).float().squeeze(-1))
+def distance_of(place: Tensor, aim: Tensor, *, all_pairs: bool = False) -> Tensor:
+    """The distance [...] in full steps of places and aims [..., 32]; with `all_pairs` [..., N, M] of N and M."""
+    if not all_pairs:
+        return ((place - aim).square().sum(-1) + NEAR).sqrt()
+    inner = place @ aim.transpose(-1, -2)
+    squares = place.square().sum(-1)[..., None] + aim.square().sum(-1)[..., None, :] - 2 * inner
+    return (squares.clamp(min=0.0) + NEAR).sqrt()
