@@ -202,6 +202,22 @@ def test_results_of_another_run_are_not_mixed_in(tmp_path, monkeypatch):
         run_bench(plan)
 
 
+def test_a_setting_that_came_later_does_not_make_held_results_another_runs(tmp_path):
+    """It counts as its default there. A setting that is there and differs still makes them another run's."""
+    plan = prepare("oracle", Config(), tmp_path / "o.json", limit=1)
+    origin = bench_module.facts(plan, "c")
+    older = json.loads(json.dumps(origin))
+    del older["config"]["planner"]["candidates"], older["config"]["viewer"]
+    assert bench_module.differing(older, origin) == []
+    older["config"]["planner"]["step_m"] = 0.01
+    assert bench_module.differing(older, origin) == ["config"]
+    changed = prepare("oracle", Config(planner={"candidates": 70}, scene={"file": plan.config.scene.file}), plan.out,
+                      limit=1)
+    assert bench_module.differing(json.loads(json.dumps(origin)), bench_module.facts(changed, "c")) == ["config"]
+    older["config"]["planner"]["step_m"] = origin["config"]["planner"]["step_m"]
+    assert bench_module.differing(older, bench_module.facts(changed, "c")) == ["config"]
+
+
 def test_scene_that_fails_keeps_the_others(tmp_path):
     """Weights that are damaged after the start: one line with the scene, and the earlier results are still there."""
     names = ("coffee_can", "soup_can")

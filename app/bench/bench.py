@@ -10,7 +10,7 @@ import hashlib
 import json
 import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -129,6 +129,19 @@ def facts(plan: Plan, command: str) -> dict[str, Any]:
             ({"symmetry": symmetric} if symmetric else {}), "config": config}
 
 
+def differing(held: Mapping[str, Any], origin: Mapping[str, Any]) -> list[str]:
+    """Which of the facts that matter differ. A setting that came after the held results were made counts there as its
+    default."""
+    held = {**held, "config": _completed(held.get("config"), Config().model_dump(mode="json"))}
+    return [key for key in MATTERS if held.get(key) != origin[key]]
+
+
+def _completed(settings: Any, defaults: Any) -> Any:
+    if not isinstance(settings, dict) or not isinstance(defaults, dict):
+        return settings
+    return {**defaults, **{key: _completed(value, defaults.get(key)) for key, value in settings.items()}}
+
+
 def bench(plan: Plan, *, jobs: int, command: str, console: Console, cluster: str | None = None) -> list[dict[str, Any]]:
     """Runs the scenes that have no result yet, writes `plan.out` and prints the table. Returns the records in the
     file's order.
@@ -173,9 +186,8 @@ def _take_up(plan: Plan, origin: dict[str, Any]) -> dict[str, dict[str, Any]]:
     for line in text.split("\n")[:-1]:
         entry = _entry(line)
         if isinstance(facts := entry.get("facts"), dict):
-            for key in MATTERS:
-                if facts.get(key) != origin[key]:
-                    raise SaccadeError(f"{plan.partial} holds results of another run (its {key} differ): {need}")
+            if differ := differing(facts, origin):
+                raise SaccadeError(f"{plan.partial} holds results of another run (its {differ[0]} differ): {need}")
         elif entry.keys() >= set(RECORD_KEYS) and isinstance(entry["scene"], str):
             records[entry["scene"]] = entry
     with _kept(plan, len(records), len(plan.chosen)):

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from saccade.app.bench.bench import MATTERS, Plan, bench, facts, prepare
+from saccade.app.bench.bench import Plan, bench, differing, facts, prepare
 from saccade.app.bench.charts import draw_errors, draw_final_views
 from saccade.app.bench.repeat import Results, prepare_again, read_results, replay
 from saccade.app.bench.table import MEASURES, PAPER_AGENTS, PAPER_ROOM, Row, milliseconds, rows, summarise
@@ -82,8 +82,7 @@ def _is_there(plan: Plan, command: str) -> bool:
         return False
     results, origin = read_results(plan.out), facts(plan, command)
     held = {record["scene"] for record in results.records}
-    same = all(results.facts[key] == origin[key] for key in MATTERS)
-    return same and held >= {plan.scenes[number].id for number in plan.chosen}
+    return not differing(results.facts, origin) and held >= {plan.scenes[number].id for number in plan.chosen}
 
 
 def _configuration(agent: str, objects: str) -> Config:
