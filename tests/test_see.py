@@ -32,7 +32,7 @@ class RedThings:
     def __init__(self, square: bool = True):
         self.square, self.shapes, self.intrinsics = square, [], []
 
-    def see(self, rgb, intrinsics_px, up, depth_m=None) -> Seen:
+    def see(self, rgb, intrinsics_px, up, depth_m=None, *, alone=False) -> Seen:
         assert up == (0.0, 1.0, 0.0)
         self.shapes.append(rgb.shape)
         self.intrinsics.append(intrinsics_px)

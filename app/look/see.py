@@ -22,7 +22,6 @@ from saccade.app.look.sights import Look, Sight
 from saccade.app.run.registry import AGENTS, agent_of
 from saccade.app.run.threads import limit_torch
 from saccade.services.perception.core import Model, model_of
-from saccade.services.perception.open_world import OpenWorld
 from saccade.services.perception.seen import Seen
 from saccade.shared.bus.messages import mask_of
 from saccade.shared.config import Config, load
@@ -54,15 +53,13 @@ class Looker:
         self.names = names_in_use(config.scene)
         self.weights = weights_in_use(config)
         self.model: Model = model_of(self.weights, self.names, config.perception.passes)
-        if isinstance(self.model, OpenWorld):
-            self.model.thorough = True  # nothing else says what stands in a photograph
         self.square: bool = getattr(self.model, "square", True)  # whether the networks take square images only
         self._draw = {name: artist_of(self.weights, name) for name in self.names if draw}
 
     def look(self, photo: Photograph) -> Look:
         """Looks at a photograph."""
         image = fitted(photo, square=self.square)
-        seen = self.model.see(image.rgb, image.intrinsics_px, UP)
+        seen = self.model.see(image.rgb, image.intrinsics_px, UP, alone=True)
         sights = [self._sight(image, seen, k) for k in range(len(self.names))]
         return Look(photo, image, tuple(sorted(sights, key=lambda sight: -sight.presence)))
 

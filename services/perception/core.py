@@ -68,7 +68,7 @@ class SceneCCN:
 
     @torch.inference_mode()
     def see(self, rgb: NDArray[np.uint8], intrinsics_px: ArrayLike, up: ArrayLike,
-            depth_m: NDArray[np.float32] | None = None) -> Seen:
+            depth_m: NDArray[np.float32] | None = None, *, alone: bool = False) -> Seen:
         """Infers all objects from an image [H, W, 3]. `up` [3] is the direction of up in the camera's frame. The depth
         is not used."""
         found = self.find(rgb, intrinsics_px, up)
@@ -103,8 +103,9 @@ class Model(Protocol):
     """Networks that infer all objects from one image."""
 
     def see(self, rgb: NDArray[np.uint8], intrinsics_px: ArrayLike, up: ArrayLike,
-            depth_m: NDArray[np.float32] | None = None) -> Seen:
-        """Infers all objects from an image [H, W, 3], and from its depth [H, W] where there is one and they use it."""
+            depth_m: NDArray[np.float32] | None = None, *, alone: bool = False) -> Seen:
+        """Infers all objects from an image [H, W, 3], and from its depth [H, W] where there is one and they use it.
+        Networks may take more time for an image that stands alone: no other will say more about the same things."""
 
 
 def model_of(weights: Weights, names: tuple[str, ...], passes: int) -> Model:
@@ -168,7 +169,7 @@ class Perception:
             seen = model.see(blank, goal.intrinsics_px, (0.0, 1.0, 0.0))
             seen.presence[:] = 0.0
         else:
-            seen = model.see(goal.rgb, goal.intrinsics_px, (0.0, 1.0, 0.0))
+            seen = model.see(goal.rgb, goal.intrinsics_px, (0.0, 1.0, 0.0), alone=True)
         for k, name in enumerate(self.names):
             yield Output(GOAL_PERCEPT, percept(goal, name, seen, k, np.eye(4)), name)
 

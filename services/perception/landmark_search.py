@@ -16,6 +16,7 @@ from saccade.services.perception.local_features import LocalFeatures
 from saccade.services.perception.things import FINE_PX, Things, rolled
 
 ELECTED = 24  # pairs of a roll and an object whose landmarks are fitted to a thing
+CLEAR = 60  # landmarks; where so many fit, nothing else is tried
 
 
 @dataclass(frozen=True)
@@ -51,4 +52,6 @@ class LandmarkSearch:
             fit = self.fits[k](seen[roll], focal, FINE_PX)
             if fit is not None and (best is None or fit.inliers > best.fit.inliers):
                 best = Found(k, fit, rolls[roll])
+                if fit.inliers >= CLEAR:
+                    break
         return best

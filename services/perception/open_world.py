@@ -23,7 +23,7 @@ from saccade.services.perception.landmark_search import Found, LandmarkSearch
 from saccade.services.perception.likeness import COHORT, OBJECTS, USUAL, Cohort, LogOdds
 from saccade.services.perception.local_features import LocalFeatures
 from saccade.services.perception.placed import Placed
-from saccade.services.perception.proposer import Proposals, Proposer, half_tangent, propose
+from saccade.services.perception.proposer import Proposals, Proposer, half_tangent, propose, with_whole
 from saccade.services.perception.seen import Modes, Seen, bits
 from saccade.services.perception.things import FINE_PX, Match, Things, rolled
 from saccade.services.perception.view_encoder import ViewEncoder
@@ -65,7 +65,6 @@ class OpenWorld:
     """The networks, with the banks of K objects."""
 
     square = False  # an image may have any sides
-    thorough = False  # whether landmarks are searched for in everything
 
     def __init__(self, proposer: Proposer, encoder: ViewEncoder, comparison: Comparison, features: LocalFeatures,
                  banks: list[Bank], cohort: Cohort, log_odds: LogOdds = USUAL):
@@ -80,22 +79,22 @@ class OpenWorld:
 
     @torch.inference_mode()
     def see(self, rgb: NDArray[np.uint8], intrinsics_px: ArrayLike, up: ArrayLike,
-            depth_m: NDArray[np.float32] | None = None) -> Seen:
+            depth_m: NDArray[np.float32] | None = None, *, alone: bool = False) -> Seen:
         """Infers all objects from an image [H, W, 3]. `up` [3] is the direction of up in the camera's frame. The depth
-        is not used."""
-        things = self.things(rgb, intrinsics_px, up)
+        is not used. In an image that stands `alone`, landmarks are searched for in everything, in any roll."""
+        things = self.things(rgb, intrinsics_px, up, whole=alone)
         count = len(self.banks)
         seen = _nothing(count, rgb.shape)
         if not len(things.crops):
             return seen
-        found = self.search(things, ROLLS_RAD.tolist()) if self.thorough else {}
+        found = self.search(things, ROLLS_RAD.tolist()) if alone else {}
         things, similar = self.rolled_things(things, found)
         pairs = [pair for k in range(count) for pair in self._candidates(k, similar[k], found)]
         known = torch.stack([self.view(k, view) for k, _, view in pairs])
         compared = Compared(self.comparison(things.crops[[thing for _, thing, _ in pairs]], known))
         masks = F.interpolate(things.masks[:, None], size=(MASK_PX, MASK_PX), mode="bilinear")[:, 0] > 0.5
         alike = torch.stack([similar[k][thing, view] for k, thing, view in pairs])
-        fits = self.fitted(things, {(k, thing) for k, thing, _ in pairs}, found)
+        fits = self.fitted(things, {(k, thing) for k, thing, _ in pairs}, found, quick=not alone)
         odds = self.log_odds(alike, compared.same, *self.found(pairs, fits)).double().numpy() - self.many
         for k, match in enumerate(self._matches(pairs, odds, fits)):
             seen.presence[k] = match.presence
@@ -152,7 +151,7 @@ class OpenWorld:
 
     @torch.inference_mode()
     def fitted(self, things: Things, pairs: Collection[tuple[int, int]],
-               found: Mapping[int, Found] | None = None) -> dict[tuple[int, int], Fit]:
+               found: Mapping[int, Found] | None = None, *, quick: bool = True) -> dict[tuple[int, int], Fit]:
         """How the landmarks of objects fit things, for those of the `pairs` (object, thing) where enough do. What was
         `found` is not fitted again."""
         fits = {(each.object, thing): each.fit for thing, each in (found or {}).items()}
@@ -161,7 +160,7 @@ class OpenWorld:
         seen = dict(zip(wanted, self.features(things.fine[wanted], FEATURES) if wanted else [], strict=True))
         for k, thing in left:
             half = float(things.window.half_tangent[thing])
-            fit = self.fits[k](seen[thing], FINE_PX / 2 / half, FINE_PX, quick=not self.thorough)
+            fit = self.fits[k](seen[thing], FINE_PX / 2 / half, FINE_PX, quick=quick)
             if fit is not None:
                 fits[k, thing] = fit
         return fits
@@ -208,8 +207,9 @@ class OpenWorld:
         return matches
 
     @torch.inference_mode()
-    def things(self, rgb: NDArray[np.uint8], intrinsics_px: ArrayLike, up: ArrayLike) -> Things:
-        """Finds the things in an image, and cuts them out."""
+    def things(self, rgb: NDArray[np.uint8], intrinsics_px: ArrayLike, up: ArrayLike, *,
+               whole: bool = False) -> Things:
+        """Finds the things in an image, and cuts them out. The `whole` image may be one more thing."""
         image = torch.from_numpy(np.array(rgb)).permute(2, 0, 1).float() / 255.0
         height, width = rgb.shape[:2]
         share = INPUT_PX / max(height, width)
@@ -217,6 +217,8 @@ class OpenWorld:
         small = F.interpolate(image[None], size=size, mode="area" if share < 1 else "bilinear")
         foreground, votes = self.proposer(small.contiguous(memory_format=torch.channels_last))
         found = propose(foreground[0], votes[0])
+        if whole:
+            found = with_whole(found, foreground[0])
         return self._cut(image, found, width / size[1], height / size[0], intrinsics_px, up)
 
     def _cut(self, image: Tensor, found: Proposals, right: float, down: float, intrinsics_px: ArrayLike,

@@ -124,7 +124,7 @@ class PaperSceneCCN:
 
     @torch.inference_mode()
     def see(self, rgb: NDArray[np.uint8], intrinsics_px: ArrayLike, up: ArrayLike,
-            depth_m: NDArray[np.float32] | None = None) -> Seen:
+            depth_m: NDArray[np.float32] | None = None, *, alone: bool = False) -> Seen:
         """Infers all objects from an image [H, H, 3]. The paper's crops use neither intrinsics, `up` nor depth."""
         image = torch.from_numpy(np.array(rgb)).permute(2, 0, 1).float() / 255.0
         everyone = image.expand(len(self.cards), 1, -1, -1, -1)

@@ -143,7 +143,7 @@ class PoseCNN:
 
     @torch.inference_mode()
     def see(self, rgb: NDArray[np.uint8], intrinsics_px: ArrayLike, up: ArrayLike,
-            depth_m: NDArray[np.float32] | None = None) -> Seen:
+            depth_m: NDArray[np.float32] | None = None, *, alone: bool = False) -> Seen:
         """Infers all objects from an image [H, H, 3], and from its depth [H, H] where there is one. `up` is not
         used."""
         width = rgb.shape[1]

@@ -130,3 +130,10 @@ def _peak(aimed: Tensor, weight: Tensor, radius: Tensor, height: int, width: int
     smooth = F.avg_pool2d(counts.view(1, 1, height + 16, width + 16), 3, 1, 1).flatten()
     best = int(smooth.argmax())
     return torch.tensor([(best % (width + 16) - 8 + 0.5) * STRIDE, (best // (width + 16) - 8 + 0.5) * STRIDE])
+
+
+def with_whole(found: Proposals, foreground: Tensor) -> Proposals:
+    """What was found, and the whole image, with all that is in the foreground, logits [h, w]."""
+    size = torch.tensor([foreground.shape[1], foreground.shape[0]], dtype=torch.float32) * STRIDE
+    return Proposals(torch.cat([found.center, size[None] / 2]), torch.cat([found.radius, size.max()[None] / 2]),
+                     torch.cat([found.masks, foreground.sigmoid()[None]]))

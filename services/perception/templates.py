@@ -85,7 +85,7 @@ class TemplateMatcher:
         return self.world.render(camera).transpose(2, 0, 1).astype(np.float32) / 255.0
 
     def see(self, rgb: NDArray[np.uint8], intrinsics_px: ArrayLike, up: ArrayLike,
-            depth_m: NDArray[np.float32] | None = None) -> Seen:
+            depth_m: NDArray[np.float32] | None = None, *, alone: bool = False) -> Seen:
         """Infers all objects from an image [H, W, 3]. `up` [3] is the direction of up in the camera's frame. The depth
         is not used."""
         found = self.detector.find(rgb, intrinsics_px, up)
