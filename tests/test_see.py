@@ -236,7 +236,8 @@ def test_of_several_photographs_the_good_ones_are_told(monkeypatch, capsys, tmp_
 
 def test_where_nothing_is_seen_no_table_is_printed(monkeypatch, capsys, tmp_path, red_things):
     model = red_things()
-    monkeypatch.setattr(model, "see", lambda *a, see=model.see: dataclasses.replace(see(*a), presence=np.full(5, 0.5)))
+    unsure = {"presence": np.full(5, 0.5)}
+    monkeypatch.setattr(model, "see", lambda *a, see=model.see, **k: dataclasses.replace(see(*a, **k), **unsure))
     with_red((100, 80), (10, 10, 50, 50)).save(tmp_path / "[red].png")
     code, out, _, entries = seen(monkeypatch, capsys, tmp_path, tmp_path / "[red].png", "--out", tmp_path)
     assert code == 0

@@ -82,11 +82,9 @@ class OpenWorld:
             depth_m: NDArray[np.float32] | None = None, *, alone: bool = False) -> Seen:
         """Infers all objects from an image [H, W, 3]. `up` [3] is the direction of up in the camera's frame. The depth
         is not used. In an image that stands `alone`, landmarks are searched for in everything, in any roll."""
-        things = self.things(rgb, intrinsics_px, up, whole=alone)
+        things = self.things(rgb, intrinsics_px, up, whole=True)
         count = len(self.banks)
         seen = _nothing(count, rgb.shape)
-        if not len(things.crops):
-            return seen
         found = self.search(things, ROLLS_RAD.tolist()) if alone else {}
         things, similar = self.rolled_things(things, found)
         pairs = [pair for k in range(count) for pair in self._candidates(k, similar[k], found)]
@@ -177,11 +175,12 @@ class OpenWorld:
 
     def _candidates(self, k: int, similar: Tensor, found: Mapping[int, Found]) -> list[tuple[int, int, int]]:
         """Which things are compared with object k, and with which of its views: (object, thing, view). Things are like
-        it by `similar` [P, V], or it was found there."""
+        it by `similar` [P, V], or it was found there, or they are the whole image, the last one: what is near fills
+        it."""
         directions = self.banks[k].directions
         likest = similar.max(1).values.topk(min(CANDIDATES, len(similar))).indices.tolist()
         pairs = []
-        for thing in sorted({*likest, *(n for n, each in found.items() if each.object == k)}):
+        for thing in sorted({*likest, len(similar) - 1, *(n for n, each in found.items() if each.object == k)}):
             left = similar[thing].clone()
             for _ in range(CANDIDATES):
                 view = int(left.argmax())

@@ -20,7 +20,7 @@ STEP = 0.05  # of the numbers of a descriptor, as they are kept: one of 16 in ha
 
 @dataclass(frozen=True)
 class Landmarks:
-    """N landmarks, those that are found again most often first.
+    """N landmarks, those first that are found again most often, from all sides in turn.
 
     points_m [N, 3] are their places in the object's frame, codes [N, 64] uint8 the numbers of their descriptors in 16
     steps, seen [SIDES, N] whether one is seen from a side, the directions of `fibonacci_sphere(SIDES)`. `usual` is how

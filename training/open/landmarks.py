@@ -23,6 +23,7 @@ SIDE_PX = 256  # of a view
 SMALL_PX, NOISE = 100, 0.01  # sides of a small picture, and its noise
 PER_VIEW = 250  # places in each view: the surest ones
 TOGETHER_PX, ALIKE = 2.0, 0.85  # places so near, with descriptors whose product is so large, are one landmark
+FACES = 12  # that have about as many landmarks among the first ones
 OFTEN = 3  # a landmark is found in so many pictures, or it is not kept
 RANGE = 4.0  # of the camera, in half diagonals of the object, between these ranges (m)
 NEAREST_M, FARTHEST_M = 0.2, 2.0
@@ -109,9 +110,20 @@ def merged(views: list[Places], together_m: float) -> Landmarks:
     side = np.repeat([_side(view.towards) for view in views], [len(view.points_m) for view in views])
     seen = np.zeros((SIDES, len(counts)), dtype=bool)
     seen[side, of] = True
-    kept = np.argsort(-counts, kind="stable")[:MOST]
+    kept = np.argsort(-counts, kind="stable")
     kept = kept[counts[kept] >= OFTEN]
+    kept = kept[_even(seen[:, kept])][:MOST]
     return Landmarks(middle[kept].astype(np.float32), coded(unit(mean[kept]).astype(np.float32)), seen[:, kept])
+
+
+def _even(seen: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """An order of N landmarks, of which the earlier are the better, so that the first ones lie on all faces of the
+    object. `seen` [SIDES, N] says from where they are seen."""
+    faces = (fibonacci_sphere(FACES) @ (seen.T @ fibonacci_sphere(SIDES)).T).argmax(0)
+    rank = np.zeros(len(faces), dtype=np.intp)
+    for face in range(FACES):
+        rank[faces == face] = np.arange((faces == face).sum())
+    return np.argsort(rank, kind="stable")
 
 
 def _groups(points_m: NDArray[np.float64], descriptors: NDArray[np.float32], together_m: float) -> NDArray[np.intp]:
