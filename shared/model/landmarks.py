@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from saccade.shared.world.geometry import fibonacci_sphere
 
+FORM = 2  # of the landmarks in a bank; those of another are made again
 DESCRIPTOR = 64  # numbers of a descriptor
 MOST = 6_000  # landmarks of an object
 SIDES = 60  # from which an object is seen

@@ -26,6 +26,7 @@ from safetensors.numpy import load, save
 from saccade.shared.config import WEIGHTS, Config, set_folder
 from saccade.shared.errors import SaccadeError, is_text, told
 from saccade.shared.files import MIB, parse_json, read_bytes, read_text, replace_all, writing
+from saccade.shared.model.landmarks import FORM
 
 if TYPE_CHECKING:
     from torch import nn
@@ -95,8 +96,8 @@ class Weights:
     @property
     def basis(self) -> str:
         """What says which networks these are: a hash of the hashes of their files, and of that of the local features
-        which banks hold."""
-        others = str(self.manifest.get("local_features", ""))
+        which banks hold and of the form in which they do."""
+        others = f"{self.manifest.get('local_features', '')} {FORM}"
         return hashlib.sha256("".join([*sorted(self.hashes.values()), others]).encode()).hexdigest()
 
     @property
