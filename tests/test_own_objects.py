@@ -91,7 +91,7 @@ def test_a_set_is_named_or_its_folder_is_given(learnt):
         own_folder("ycb")
 
 
-def test_who_uses_what_is_not_learnt_is_told_what_to_do(home, console):
+def test_who_uses_what_is_not_learnt_is_told_what_to_do(home, console, monkeypatch):
     added("my", "tea")
     config = Config().with_values({"scene.objects": "my"})
     with pytest.raises(SaccadeError, match=r"set 'my' is one of your own, .* add `--agent open`"):
@@ -104,6 +104,10 @@ def test_who_uses_what_is_not_learnt_is_told_what_to_do(home, console):
     added("my", "rice")
     with pytest.raises(SaccadeError, match="object 'rice' of the set 'my' is not learnt: `saccade objects learn"):
         weights_in_use(config.with_values({"scene.names": ["tea", "rice"]}))
+    with monkeypatch.context() as patch:
+        patch.setattr("saccade.shared.model.weights.FORM", 0)
+        with pytest.raises(SaccadeError, match="was learnt with other networks than these"):
+            weights_in_use(config.with_values({"scene.names": ["tea"]}))
     manifest = learned_folder("my", OPEN) / MANIFEST
     manifest.write_text(manifest.read_text().replace('"networks_sha256": "', '"networks_sha256": "0'))
     with pytest.raises(SaccadeError, match="was learnt with other networks than these"):
