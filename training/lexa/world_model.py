@@ -43,13 +43,11 @@ class ImageDecoder(nn.Module):
 
 
 class Learner(nn.Module):
-    """All networks of a training run: those that act, and the decoder, the encoding's prediction, the ensemble, the
-    explorer and its critic."""
+    """All networks of a training run: those that act, and the decoder, the ensemble, the explorer and its critic."""
 
     def __init__(self) -> None:
         super().__init__()
         self.actor, self.decoder = Actor(), ImageDecoder()
-        self.encoding = perceptron(FEATURE, EMBEDDED)
         self.ensemble = nn.ModuleList(perceptron(FEATURE + ACTIONS, EMBEDDED) for _ in range(ENSEMBLE))
         self.explorer = Policy(FEATURE)
         self.worth_explored = perceptron(FEATURE, 1)
@@ -112,7 +110,7 @@ def divergence(posterior: Tensor, prior: Tensor) -> Tensor:
 
 def model_loss(learner: Learner, batch: Sequences, encodings: Tensor, states: State, posterior: Tensor,
                prior: Tensor, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
-    """The loss of the world model and its parts: the error of some images, the KL terms, and the encoding's error."""
+    """The loss of the world model and its parts: the error of some images, and the KL terms."""
     count, length = encodings.shape[:2]
     chosen = torch.rand(count, length, generator=generator, device=encodings.device).argsort(1)[:, :DRAWN]
     rows = torch.arange(count, device=encodings.device)[:, None]
@@ -120,9 +118,7 @@ def model_loss(learner: Learner, batch: Sequences, encodings: Tensor, states: St
     image = 0.5 * PRECISION * (drawn - batch.images[rows, chosen].flatten(0, 1)).square().sum((1, 2, 3)).mean()
     forward = divergence(posterior.detach(), prior).clamp(min=FREE_NATS).mean()
     backward = divergence(posterior, prior.detach()).clamp(min=FREE_NATS).mean()
-    encoding = F.mse_loss(learner.encoding(states.feature.detach()).float(), encodings.detach())
-    loss = image + PRIOR_SHARE * forward + POSTERIOR_SHARE * backward + encoding
-    return loss, {"image": image, "kl": forward, "encoding": encoding}
+    return image + PRIOR_SHARE * forward + POSTERIOR_SHARE * backward, {"image": image, "kl": forward}
 
 
 def ensemble_loss(learner: Learner, states: State, actions: Tensor, encodings: Tensor) -> Tensor:
