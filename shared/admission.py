@@ -1,4 +1,4 @@
-"""Who may use the ports that a browser opens: the Host, the Origin and the token of an HTTP request.
+"""The ports that a browser comes to, and who may use them: the Host, the Origin and the token of an HTTP request.
 
 A page of another site must not read the run, not even under a name that its owner lets point to this machine (DNS
 rebinding). A browser cannot forge the headers Host and Origin, so they tell whose page asks. They tell nothing about a
@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import ipaddress
 import secrets
+import socket
 from dataclasses import dataclass
 from urllib.parse import parse_qs, urlsplit
 
 from saccade.shared.config import ViewerConfig
+from saccade.shared.errors import SaccadeError
 
 TOKEN_BYTES = 18
 ONCE = ("host", "origin", "cookie", "content-length")  # a request with two of these is malformed
@@ -120,3 +122,15 @@ def with_token(config: ViewerConfig) -> ViewerConfig:
     """The configuration with a new token if other hosts reach the viewer, without one if not."""
     is_open = not is_loopback(config.published or config.address)
     return config.model_copy(update={"token": secrets.token_urlsafe(TOKEN_BYTES) if is_open else None})
+
+
+def open_port(service: str, address: str, port: int, key: str) -> socket.socket:
+    """A socket that listens at a port. `key` is that of the configuration which names the port. Raises SaccadeError if
+    it cannot be opened."""
+    family = socket.AF_INET6 if ":" in address else socket.AF_INET
+    try:
+        return socket.create_server((address, port), family=family,
+                                    dualstack_ipv6=address == "::" and socket.has_dualstack_ipv6())
+    except OSError as error:
+        raise SaccadeError(f"{service}: port {port} of {address} cannot be opened ({error.strerror}): "
+                           f"choose another with {key}") from error

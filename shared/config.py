@@ -383,12 +383,12 @@ def load(path: Path | None, preset: str | None = None) -> Config:
     base = _tree(Path(preset)) if preset else {}
     if path is None or str(path) == "default":
         return validate(base, f"preset {preset}")
-    return validate(_merged(base, _tree(path)), str(path))
+    return validate(merged(base, _tree(path)), str(path))
 
 
-def _merged(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+def merged(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
     """Returns a tree that holds what `over` says, and for the rest what `base` says."""
-    both = {key: _merged(base[key], over[key]) for key in base.keys() & over.keys()
+    both = {key: merged(base[key], over[key]) for key in base.keys() & over.keys()
             if isinstance(base[key], dict) and isinstance(over[key], dict)}
     return base | over | both
 

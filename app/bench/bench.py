@@ -29,7 +29,7 @@ from saccade.app.run.registry import Pair, local_pairs, weight_hashes
 from saccade.services.simulator.scenes import Scene, load_scenes
 from saccade.shared.bus.messages import Message, Result
 from saccade.shared.bus.topics import Topic
-from saccade.shared.config import Config
+from saccade.shared.config import Config, merged
 from saccade.shared.errors import SaccadeError
 from saccade.shared.files import MIB, append_line, parse_json, read_text, replace_whole, writing
 from saccade.shared.log.provenance import commit
@@ -132,14 +132,9 @@ def facts(plan: Plan, command: str) -> dict[str, Any]:
 def differing(held: Mapping[str, Any], origin: Mapping[str, Any]) -> list[str]:
     """Which of the facts that matter differ. A setting that came after the held results were made counts there as its
     default."""
-    held = {**held, "config": _completed(held.get("config"), Config().model_dump(mode="json"))}
+    if isinstance(config := held.get("config"), dict):
+        held = {**held, "config": merged(Config().model_dump(mode="json"), config)}
     return [key for key in MATTERS if held.get(key) != origin[key]]
-
-
-def _completed(settings: Any, defaults: Any) -> Any:
-    if not isinstance(settings, dict) or not isinstance(defaults, dict):
-        return settings
-    return {**defaults, **{key: _completed(value, defaults.get(key)) for key, value in settings.items()}}
 
 
 def bench(plan: Plan, *, jobs: int, command: str, console: Console, cluster: str | None = None) -> list[dict[str, Any]]:

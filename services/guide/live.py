@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import closing, suppress
+from contextlib import closing
 from pathlib import Path
 
 from saccade.services.guide.core import SHOWN, Guide
 from saccade.services.guide.server import PageServer
 from saccade.shared.bus.topics import GOAL
 from saccade.shared.bus.transport import Bus, ZenohBus
-from saccade.shared.bus.wire import MessageError, decode
 from saccade.shared.config import Config
 from saccade.shared.errors import SaccadeError
-from saccade.shared.loop.process import Health, Heartbeat, Inbox, run_process
+from saccade.shared.loop.process import Health, Heartbeat, Inbox, messages_of, run_process
 from saccade.shared.model.weights import Weights
 
 NAME = "guide"
 QUEUE_BYTES = 16 * 1024 * 1024  # of messages that wait; what does not fit is dropped
-TICK_S = 0.5
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -39,19 +37,11 @@ def _work(config: Config, folder: Path, inbox: Inbox) -> None:
 def listen(bus: Bus, guide: Guide, inbox: Inbox, health: Health) -> None:
     """Passes the messages of the run that `health` names to the guide, until the inbox is stopped."""
     bus.subscribe(SHOWN, inbox.put)
-    run = health.at[0]
-    for kept in bus.recall([GOAL], (run, 0, 0)):
+    for kept in bus.recall([GOAL], (health.at[0], 0, 0)):
         inbox.put(kept.topic, kept.part, kept.payload)
-    for item in inbox.items(0.0, TICK_S):
-        if item is None:
-            continue
-        topic, _, payload = item
-        health.received += 1
-        with suppress(MessageError):  # the services that compute with the message count it as refused
-            message = decode(topic.type, payload)
-            if message.run == run:
-                guide.take(message)
-                health.at = (message.run, message.episode, message.step)
+    for _, _, message in messages_of(inbox, health):
+        guide.take(message)
+        health.at = (message.run, message.episode, message.step)
 
 
 def _sizes_m(config: Config) -> dict:

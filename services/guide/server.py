@@ -8,15 +8,13 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import socket
 import threading
 from pathlib import Path
 from typing import NamedTuple
 
 from saccade.services.guide.core import Guide
-from saccade.shared.admission import Head, Rules, head_of
+from saccade.shared.admission import Head, Rules, head_of, open_port
 from saccade.shared.config import ViewerConfig
-from saccade.shared.errors import SaccadeError
 
 PAGE = Path(__file__).with_name("page.html")
 MOST = 32  # connections at the same time; more are closed at once
@@ -42,7 +40,8 @@ class PageServer:
 
     def __init__(self, config: ViewerConfig, guide: Guide) -> None:
         self._guide, self._rules, self._page = guide, Rules(config.guide_port, config.token), PAGE.read_bytes()
-        self._socket, self.port = _listen(config), config.guide_port
+        self.port = config.guide_port
+        self._socket = open_port("guide", config.address, self.port, "viewer.guide_port")
         self._connections = 0
         self._loop = asyncio.new_event_loop()
         self._stop = asyncio.Event()
@@ -113,13 +112,3 @@ def _encoded(answer: Answer, *, body: bool) -> bytes:
             f"Content-Length: {len(answer.content)}\r\nCache-Control: no-store\r\nX-Content-Type-Options: nosniff\r\n"
             f"Content-Security-Policy: {POLICY}\r\nConnection: close\r\n\r\n")
     return head.encode() + (answer.content if body else b"")
-
-
-def _listen(config: ViewerConfig) -> socket.socket:
-    address, port = config.address, config.guide_port
-    try:
-        return socket.create_server((address, port), family=socket.AF_INET6 if ":" in address else socket.AF_INET,
-                                    dualstack_ipv6=address == "::" and socket.has_dualstack_ipv6())
-    except OSError as error:
-        raise SaccadeError(f"guide: port {port} of {address} cannot be opened ({error.strerror}): choose another with "
-                           "viewer.guide_port") from error

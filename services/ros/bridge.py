@@ -5,17 +5,15 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Callable, Sequence
-from contextlib import closing, suppress
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from saccade.services.ros.core import Teller
 from saccade.shared.bus.sequences import Sequences
-from saccade.shared.bus.topics import Topic
 from saccade.shared.bus.transport import ZenohBus
-from saccade.shared.bus.wire import MessageError, decode
 from saccade.shared.config import Config, RosConfig
-from saccade.shared.loop.process import Health, Heartbeat, Inbox, run_process
+from saccade.shared.loop.process import Health, Heartbeat, Inbox, messages_of, run_process
 from saccade.shared.ros.keys import GID_BYTES, attachment, key_of, node_token, publisher_token
 from saccade.shared.ros.session import open_ros
 from saccade.shared.ros.types import MARKERS, POSE, encode, hash_of, require_types
@@ -27,7 +25,6 @@ NAME = "ros"
 NODE = "saccade"
 WORLD = "world"  # the frame of the viewpoint if the configuration names none
 QUEUE_BYTES = 64 * 1024 * 1024  # of messages that wait; what does not fit is dropped
-TICK_S = 0.5
 PUBLISHED = {POSE: "viewpoint", MARKERS: "beliefs"}
 
 
@@ -51,24 +48,14 @@ def _work(config: Config, folder: Path, inbox: Inbox) -> None:
 def bridge(teller: Teller, node: Node, inbox: Inbox, health: Health,
            clock_ns: Callable[[], int] = time.time_ns) -> None:
     """Passes on the messages of the run that `health` names, once each, until the inbox is stopped."""
-    run, sequences = health.at[0], Sequences()
-    for item in inbox.items(0.0, TICK_S):
-        if item is None:
+    sequences = Sequences()
+    for topic, part, message in messages_of(inbox, health):
+        if sequences.take(topic, part, message) is None:
             continue
-        topic, part, payload = item
-        health.received += 1
-        with suppress(MessageError):  # the services that compute with the message count it as refused
-            message = decode(topic.type, payload)
-            if (run and message.run != run) or _taken_before(sequences, topic, part, message):
-                continue
-            health.at = (message.run, message.episode, message.step)
-            for kind, content in teller.take(message, clock_ns()):
-                node.publish(kind, content, clock_ns())
-                health.published += 1
-
-
-def _taken_before(sequences: Sequences, topic: Topic, part: str | None, message: Any) -> bool:
-    return sequences.take(topic, part, message) is None
+        health.at = (message.run, message.episode, message.step)
+        for kind, content in teller.take(message, clock_ns()):
+            node.publish(kind, content, clock_ns())
+            health.published += 1
 
 
 class Node:

@@ -14,7 +14,7 @@ import threading
 from collections.abc import Awaitable, Callable
 from urllib.parse import quote
 
-from saccade.shared.admission import Head, Rules, head_of
+from saccade.shared.admission import Head, Rules, head_of, open_port
 from saccade.shared.config import ViewerConfig
 from saccade.shared.errors import SaccadeError
 
@@ -46,8 +46,8 @@ class Door:
         self._pages, self._data = pages, data
         self._sockets: list[socket.socket] = []
         try:
-            self._sockets.append(_listen(config.address, config.port, "viewer.port"))
-            self._sockets.append(_listen(config.address, data_port, "viewer.data_port"))
+            self._sockets.append(open_port("viewer", config.address, config.port, "viewer.port"))
+            self._sockets.append(open_port("viewer", config.address, data_port, "viewer.data_port"))
         except SaccadeError:
             self.close()
             raise
@@ -205,16 +205,6 @@ def _alone(head: Head) -> bytes:
     kept = (f"{name}: {value}" for name, value in head.headers.items()
             if name not in ("connection", "keep-alive", "upgrade", "cookie", "authorization"))
     return "\r\n".join([f"{head.method} {head.target} HTTP/1.1", *kept, "connection: close"]).encode("latin-1") + END
-
-
-def _listen(address: str, port: int, key: str) -> socket.socket:
-    family = socket.AF_INET6 if ":" in address else socket.AF_INET
-    try:
-        return socket.create_server((address, port), family=family,
-                                    dualstack_ipv6=address == "::" and socket.has_dualstack_ipv6())
-    except OSError as error:
-        raise SaccadeError(f"viewer: port {port} of {address} cannot be opened ({error.strerror}): "
-                           f"choose another with {key}") from error
 
 
 def policy() -> str:

@@ -15,10 +15,10 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from saccade.shared.bus.messages import Status
+from saccade.shared.bus.messages import Message, Status
 from saccade.shared.bus.topics import STATUS, Topic
 from saccade.shared.bus.transport import Bus
-from saccade.shared.bus.wire import MessageError, encode
+from saccade.shared.bus.wire import MessageError, decode, encode
 from saccade.shared.config import Config, load
 from saccade.shared.errors import SaccadeError
 
@@ -188,6 +188,21 @@ class Heartbeat:
         except MessageError as error:
             return encode(Status(run="", episode=0, step=0, seq=self._seq, service=status.service, state=status.state,
                                  note=f"its status cannot be told: {error}"))
+
+
+def messages_of(inbox: Inbox, health: Health) -> Iterator[tuple[Topic, str | None, Message]]:
+    """Yields the messages of the run that `health` names, or of all if it names none, with their topics and parts,
+    until the inbox is stopped. It counts what is received. It is for onlookers: what is malformed is passed over,
+    because the services that compute with the message count it as refused."""
+    run = health.at[0]
+    for topic, part, payload in filter(None, inbox.items(drain_s=0.0)):
+        health.received += 1
+        try:
+            message = decode(topic.type, payload)
+        except MessageError:
+            continue
+        if not run or message.run == run:
+            yield topic, part, message
 
 
 def run_process(name: str, work: Callable[[Config, Path, Inbox], None], *, inbox: Inbox | None = None,

@@ -31,7 +31,12 @@ def read_image(path: Path, *, what: str = "image", need: str = _NEED) -> NDArray
     Raises SaccadeError, which begins with `what` and ends with `need`, if the file is not a whole PNG or JPEG in RGB.
     """
     with _opened_rgb(path, what, need) as image:
-        return np.array(ImageOps.exif_transpose(image) if image.format != "PNG" else image)
+        return np.array(upright(image))
+
+
+def upright(image: Image.Image) -> Image.Image:
+    """A JPEG, turned as its EXIF orientation says; another image as it is."""
+    return ImageOps.exif_transpose(image) if image.format != "PNG" else image
 
 
 def image_size(path: Path, *, what: str = "image", need: str = _NEED) -> Size:

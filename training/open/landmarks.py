@@ -9,6 +9,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
+from scipy.ndimage import binary_erosion
 from scipy.spatial import cKDTree
 
 from saccade.services.perception.landmark_fit import FEATURES, LandmarkFit
@@ -107,7 +108,8 @@ def merged(views: list[Places], together_m: float) -> Landmarks:
     middle = np.stack([np.bincount(of, column) for column in points.T], 1) / np.maximum(counts, 1)[:, None]
     mean = np.zeros((len(counts), DESCRIPTOR), dtype=np.float32)
     np.add.at(mean, of, descriptors)
-    side = np.repeat([_side(view.towards) for view in views], [len(view.points_m) for view in views])
+    towards = np.stack([view.towards for view in views])
+    side = np.repeat((towards @ fibonacci_sphere(SIDES).T).argmax(1), [len(view.points_m) for view in views])
     seen = np.zeros((SIDES, len(counts)), dtype=bool)
     seen[side, of] = True
     kept = np.argsort(-counts, kind="stable")
@@ -144,15 +146,8 @@ def _groups(points_m: NDArray[np.float64], descriptors: NDArray[np.float32], tog
     return of
 
 
-def _side(towards: NDArray[np.float64]) -> int:
-    """The number of the side that a direction [3] is nearest to."""
-    return int((fibonacci_sphere(SIDES) @ towards).argmax())
-
-
 def _inside(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The pixels of a mask that are not near its border."""
-    inside = np.pad(mask, BORDER_PX)
-    for axis in (0, 1):
-        for shift in range(-BORDER_PX, BORDER_PX + 1):
-            inside = inside & np.roll(np.pad(mask, BORDER_PX), shift, axis)
-    return inside[BORDER_PX:-BORDER_PX, BORDER_PX:-BORDER_PX]
+    """The pixels of a mask that are not near its border, along rows and columns."""
+    cross = np.zeros((2 * BORDER_PX + 1,) * 2, dtype=bool)
+    cross[BORDER_PX] = cross[:, BORDER_PX] = True
+    return np.asarray(binary_erosion(mask, cross))

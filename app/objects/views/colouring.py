@@ -26,24 +26,24 @@ MARGIN_PX = 4
 def coloured_parts(hull: Hull) -> tuple[list[Part], float]:
     """The parts of a surface, one for each picture that colours some of it, and the share of its area that is seen."""
     corners = hull.points_m[hull.faces]
-    worth = np.stack([_worth(view, corners) for view in hull.views], axis=1)
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals, areas = unit(across), np.linalg.norm(across, axis=1)
+    worth = np.stack([_worth(view, corners, normals) for view in hull.views], axis=1)
     worth[:, ~_chosen(worth)] = 0.0
     seen = worth.max(1) > 0
     picked = _together(worth, hull.faces)
     parts = []
     for number in np.unique(picked[seen]):
         parts.append(_part(hull.views[number], corners[seen & (picked == number)]))
-    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     if not seen.all():
         parts.append(_hidden(parts, corners[~seen]))
     return parts, float(areas[seen].sum() / areas.sum())
 
 
-def _worth(view: View, corners: Array) -> NDArray[np.float32]:
-    """How well a view shows faces [F, 3, 3]: the number of pixels for a square metre, in the square root, and 0 if it
-    does not show them [F]."""
+def _worth(view: View, corners: Array, normals: Array) -> NDArray[np.float32]:
+    """How well a view shows faces [F, 3, 3] with these normals [F, 3]: the number of pixels for a square metre, in the
+    square root, and 0 if it does not show them [F]."""
     middles = corners.mean(1)
-    normals = unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     facing = (normals * unit(view.position_m - middles)).sum(1)
     pixels, depth = project(corners, view.world_from_camera, view.intrinsics_px)
     size = np.ptp(corners.reshape(-1, 3), axis=0).max()

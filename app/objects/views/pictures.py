@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageOps
+from PIL import Image
 from scipy.ndimage import map_coordinates
 
 from saccade.services.camera.poses import Poses, read_poses
@@ -20,7 +20,7 @@ from saccade.services.camera.trajectories.trajectory import ORIGIN_NOTE, Asked
 from saccade.shared.errors import SaccadeError
 from saccade.shared.world.exif import exif_of
 from saccade.shared.world.geometry import Array
-from saccade.shared.world.images import Size, opened_image
+from saccade.shared.world.images import Size, opened_image, upright
 from saccade.shared.world.photographs import Intrinsics, scaled
 
 LONGEST_PX = 1280  # to which a picture is made smaller
@@ -135,13 +135,13 @@ def read_picture(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | Non
         if image.mode not in MODES:
             raise SaccadeError(f"picture {path} has mode {image.mode}: {NEED}")
         focal_px = exif_of(image).focal_px
-        upright = ImageOps.exif_transpose(image) if image.format != "PNG" else image
-        size_px = upright.size
-        if upright.has_transparency_data:
-            rgba = np.asarray(_reduced(upright.convert("RGBA")))
+        picture = upright(image)
+        size_px = picture.size
+        if picture.has_transparency_data:
+            rgba = np.asarray(_reduced(picture.convert("RGBA")))
             mask = None if rgba[..., 3].min() == 255 else rgba[..., 3] > 127
             return np.ascontiguousarray(rgba[..., :3]), mask, size_px, focal_px
-        return np.asarray(_reduced(upright.convert("RGB"))), None, size_px, focal_px
+        return np.asarray(_reduced(picture.convert("RGB"))), None, size_px, focal_px
 
 
 def _reduced(image: Image.Image) -> Image.Image:
