@@ -226,6 +226,17 @@ def test_phase_two_can_begin_with_the_ccns_of_other_weights(finished, weights, t
         ccn_of(tmp_path, TINY.model_copy(update={"ccns": str(tmp_path / "default")}), "soup_can")
 
 
+def test_phase_two_can_go_on_from_the_networks_of_other_weights(finished, weights, tmp_path):
+    (tmp_path / "views").symlink_to(finished / "views")
+    start(tmp_path, TINY.model_copy(update={"ccns": str(weights.folder), "begin_with": str(weights.folder)}))
+    part = "soup_can.extraction"
+    trainer = Trainer(tmp_path, part)
+    before = weights.state(part)
+    assert trainer.step == 0
+    assert all(np.array_equal(value.numpy(), before[key]) for key, value in trainer.task.module.state_dict().items())
+    assert "kl" in trainer.task.loss(0)[1]  # the crop shows something from the first step on
+
+
 def test_the_measure_of_a_ccn_asks_only_for_displacements_that_it_was_trained_on(finished):
     """The paper's transition takes the azimuth as a number: beyond half a turn it has seen none."""
     asked = []
@@ -238,7 +249,7 @@ def test_the_measure_of_a_ccn_asks_only_for_displacements_that_it_was_trained_on
 
 def test_the_paper_has_its_own_defaults_and_ours_are_as_they_were():
     paper = TrainingConfig(names=NAMES, architecture="paper")
-    assert (paper.batch_ccn, paper.rate_ccn, paper.batch_extraction, paper.rate_extraction) == (150, 5e-4, 50, 1.5e-3)
+    assert (paper.batch_ccn, paper.rate_ccn, paper.batch_extraction, paper.rate_extraction) == (150, 5e-4, 100, 1.5e-3)
     assert TrainingConfig(names=NAMES, architecture="paper", batch_ccn=20).batch_ccn == 20
     assert TrainingConfig.model_validate_json(paper.model_dump_json()) == paper
     ours = TrainingConfig(names=NAMES)

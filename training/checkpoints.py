@@ -66,11 +66,26 @@ def ccn_of(run_dir: Path, config: TrainingConfig, name: str) -> tuple[dict, dict
     """
     if config.ccns is None:
         return finished(run_dir, config, name)
-    weights = Weights(Path(config.ccns))
+    return _in_weights(config, config.ccns, name, name, "ccns")
+
+
+def extraction_before(config: TrainingConfig, part: str) -> dict[str, Tensor] | None:
+    """The tensors of the networks that phase 2 of an object goes on from (`config.begin_with`), or None.
+
+    Raises SaccadeError if there are no such networks, or if the weights have another architecture.
+    """
+    if config.begin_with is None:
+        return None
+    return _in_weights(config, config.begin_with, config.object_of(part), part, "begin_with")[1]
+
+
+def _in_weights(config: TrainingConfig, folder: str, name: str, part: str, setting: str) -> \
+        tuple[dict, dict[str, Tensor]]:
+    weights = Weights(Path(folder))
     if weights.architecture != config.architecture:
         raise SaccadeError(f"weights {weights.folder} are of the architecture {weights.architecture!r}, not "
-                           f"{config.architecture!r}: name others (ccns)")
+                           f"{config.architecture!r}: name others ({setting})")
     weights.cards_of((name,))
     told = weights.manifest
-    facts = {"commit": told.get("commits", {}).get(name, "unknown"), "losses": told.get("losses", {}).get(name, {})}
-    return facts, {key: from_numpy(array) for key, array in weights.state(name).items()}
+    facts = {"commit": told.get("commits", {}).get(part, "unknown"), "losses": told.get("losses", {}).get(part, {})}
+    return facts, {key: from_numpy(array) for key, array in weights.state(part).items()}

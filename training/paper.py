@@ -29,8 +29,8 @@ SUMMED = 3 * CROP_PX ** 2
 # The KL terms count after this share of the steps. Before, a crop may show nothing, which costs thousands of nats, and
 # the mask network would learn to cut nothing out.
 KL_FROM = 0.3
-GUIDE_END = 0.1  # share of the guide's weight that is left at the end
-EVALUATED = 100  # number of images in an evaluation
+GUIDE_END = 0.3  # share of the guide's weight that is left at the end
+EVALUATED = 400  # number of images in an evaluation
 
 
 class PaperCcnTask(CcnTask):
@@ -53,11 +53,12 @@ class PaperCcnTask(CcnTask):
 class PaperExtractionTask:
     """Phase 2 for one object: trains the mask, spatial transformer and identity networks with the loss L2.
 
-    `ccn` holds the tensors of the object's finished CCN.
+    `ccn` holds the tensors of the object's finished CCN, and `before` those of the networks that training goes on
+    from, if it does not begin anew.
     """
 
     def __init__(self, config: TrainingConfig, views: list[ObjectViews], part: str, device: torch.device,
-                 ccn: dict[str, Tensor]):
+                 ccn: dict[str, Tensor], before: dict[str, Tensor] | None = None):
         torch.manual_seed(config.seed)
         name = config.object_of(part)
         mine = next(v for v in views if v.name == name)
@@ -68,6 +69,9 @@ class PaperExtractionTask:
         nn.ModuleDict({"ccn": frozen}).load_state_dict(ccn)
         self.ccn = on_device(frozen, device).eval().requires_grad_(False)
         self.module = on_device(PaperExtraction(), device)
+        if before is not None:
+            self.module.load_state_dict(before)
+        self.kl_from = KL_FROM if before is None else 0.0
         self.config, self.device, self.part = config, device, part
         self.lambdas: list[float] = []
 
@@ -84,7 +88,7 @@ class PaperExtractionTask:
         first, second = (self._pick(self.train_index, count, generator) for _ in range(2))
         batch, clean = self.frames.compose(second, generator), self.clean.clean(second)
         done, config = step / self.config.steps_extraction, self.config
-        expected = self._expected(first, second, generator) if config.kl_extraction and done >= KL_FROM else None
+        expected = self._expected(first, second, generator) if config.kl_extraction and done >= self.kl_from else None
         guide = config.guide_extraction * GUIDE_END ** done
         with torch.autocast(self.device.type, dtype=torch.bfloat16):
             return loss_l2(self.module, self.ccn, batch, clean, expected, kl=config.kl_extraction, guide=guide)

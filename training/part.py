@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from saccade.shared.errors import SaccadeError
 from saccade.shared.files import append_line, replace_whole, writing
 from saccade.shared.log.provenance import commit
-from saccade.training.checkpoints import CHECKPOINT, ccn_of, model_of, read_checkpoint, step_of
+from saccade.training.checkpoints import CHECKPOINT, ccn_of, extraction_before, model_of, read_checkpoint, step_of
 from saccade.training.dataset import load_views
 from saccade.training.paper import PaperCcnTask, PaperExtractionTask
 from saccade.training.settings import TrainingConfig, load_settings
@@ -99,7 +99,7 @@ def task_of(run_dir: Path, config: TrainingConfig, part: str, device: torch.devi
     if not extraction:
         return PaperCcnTask(config, views, part, device)
     _, ccn = ccn_of(run_dir, config, config.object_of(part))
-    return PaperExtractionTask(config, views, part, device, ccn)
+    return PaperExtractionTask(config, views, part, device, ccn, extraction_before(config, part))
 
 
 class Trainer:

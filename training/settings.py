@@ -17,7 +17,7 @@ EXTRACTION = "extraction"  # name of a part
 WHOLE = ("posecnn", "lexa")  # architectures of one part, which has the same name
 # Default settings for the paper's networks. Batches and rates are the paper's (appendix C), but there are fewer steps:
 # the paper's 5,000 epochs of 450 views are 15,000 and 25,000 steps.
-PAPER = {"steps_ccn": 5_000, "steps_extraction": 6_000, "batch_ccn": 150, "batch_extraction": 50,
+PAPER = {"steps_ccn": 5_000, "steps_extraction": 6_600, "batch_ccn": 150, "batch_extraction": 100,
          "rate_ccn": 5e-4, "rate_extraction": 1.5e-3}
 
 # The defaults of PoseCNN. It has one network for all objects, which counts as phase 2.
@@ -30,8 +30,8 @@ OPEN = {"views": 400, "steps_ccn": 6_000, "steps_extraction": 4_000, "batch_ccn"
         "rate_ccn": 1.2e-3, "rate_extraction": 1.5e-3}
 OPEN_PARTS = ("proposer", "encoder", "comparer")
 DEFAULTS: dict[str, dict[str, Any]] = {"paper": PAPER, "posecnn": POSECNN, "lexa": LEXA, "open": OPEN}
-OF_OTHERS = ("architecture", "kl_extraction", "guide_extraction", "ccns", "symmetric", "live_every", "networks",
-             "scans", "held_out", "groceries", "tables")
+OF_OTHERS = ("architecture", "kl_extraction", "guide_extraction", "ccns", "begin_with", "symmetric", "live_every",
+             "networks", "scans", "held_out", "groceries", "tables")
 
 
 class TrainingConfig(Section):
@@ -41,10 +41,11 @@ class TrainingConfig(Section):
     says what the CCNs are trained on: crops that are as wrong as the detector's, or, for comparison, clean views.
 
     With `architecture` "paper" the paper's own networks are trained as the paper describes; some settings then have
-    other defaults. Three settings belong to this architecture. `kl_extraction` is the weight of the two KL terms in
+    other defaults. Four settings belong to this architecture. `kl_extraction` is the weight of the two KL terms in
     phase 2, once they count. `guide_extraction` is the weight, at the start, of the errors of centre and scale
     themselves. The paper uses only the error of the crop; with the guide fewer steps are needed to find the object.
     `ccns` is a folder of weights whose CCNs of these objects are used unchanged, so that only phase 2 is trained.
+    `begin_with` is a folder of weights, and phase 2 goes on from its networks.
 
     With "posecnn" there is one network. `symmetric` are the objects whose rotation has the loss for symmetric objects.
 
@@ -73,8 +74,9 @@ class TrainingConfig(Section):
     crops: Literal["as_detected", "clean"] = "as_detected"
     architecture: Architecture = "default"
     kl_extraction: float = Field(1.0, ge=0)
-    guide_extraction: float = Field(300.0, ge=0)
+    guide_extraction: float = Field(1000.0, ge=0)
     ccns: str | None = None
+    begin_with: str | None = None
     symmetric: tuple[str, ...] = ()
     live_every: int = Field(20, ge=1)
     networks: str | None = None
