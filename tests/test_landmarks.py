@@ -39,13 +39,12 @@ def landmarks(features):
     return landmarks_from(load_mesh("pantry", "cereal_box"), features, count=100)
 
 
-def picture(name, towards, roll=None):
+def picture(name, towards, roll=None, range_m=RANGE_M, intrinsics=INTRINSICS):
     """An object of the pantry seen from a direction [3], by a camera whose picture has 256 px, and the camera."""
-    world = World((load_mesh("pantry", name),), size_px=SIDE_PX,
-                  intrinsics_px=INTRINSICS)
+    world = World((load_mesh("pantry", name),), size_px=SIDE_PX, intrinsics_px=intrinsics)
     world.place({name: (np.zeros(3), 0.0)})
     world.show_table(False)
-    camera = look_at(RANGE_M * towards, np.zeros(3))
+    camera = look_at(range_m * towards, np.zeros(3))
     if roll is not None:
         camera[:3, :3] = camera[:3, :3] @ roll
     image = torch.from_numpy(world.render(camera).copy()).permute(2, 0, 1)[None].float() / 255.0
@@ -64,6 +63,17 @@ def test_an_objects_pose_follows_from_its_landmarks(features, landmarks, azimuth
     assert fit.inliers > SURE
     assert float(rotation_angle(fit.camera_from_object[:3, :3], true[:3, :3])) < 0.06
     assert fit.camera_from_object[:3, 3] == pytest.approx(true[:3, 3], abs=0.02)
+
+
+def test_an_object_is_known_also_where_it_is_so_near_that_the_border_cuts_it_off(features, landmarks):
+    focal = 0.9 * SIDE_PX
+    for azimuth, elevation in ((0.3, 0.5), (1.2, 0.9), (-2.7, 0.3), (0.0, 1.2)):
+        near = picture("cereal_box", direction(azimuth, elevation), range_m=0.22,
+                       intrinsics=(focal, focal, SIDE_PX / 2, SIDE_PX / 2))
+        fit = LandmarkFit(landmarks)(features(near[0], FEATURES)[0], focal, SIDE_PX)
+        true = np.linalg.inv(near[1])
+        assert fit.inliers > SURE
+        assert float(rotation_angle(fit.camera_from_object[:3, :3], true[:3, :3])) < 0.06
 
 
 def test_landmarks_of_one_object_do_not_fit_another(features, landmarks):

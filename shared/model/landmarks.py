@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from saccade.shared.world.geometry import fibonacci_sphere
 
-FORM = 2  # of the landmarks in a bank; those of another are made again
+FORM = 3  # of the landmarks in a bank; those of another are made again
 DESCRIPTOR = 64  # numbers of a descriptor
-MOST = 6_000  # landmarks of an object
+MOST = 8_000  # landmarks of an object
 SIDES = 60  # from which an object is seen
 STEP = 0.05  # of the numbers of a descriptor, as they are kept: one of 16 in half a byte
 

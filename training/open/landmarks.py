@@ -19,7 +19,7 @@ from saccade.shared.render.mesh import Mesh
 from saccade.shared.render.world import World
 from saccade.shared.world.geometry import fibonacci_sphere, look_at, pixel_rays, unit
 
-VIEWS = 160  # from all around, each as it is and as a small, noisy picture shows it
+VIEWS = 160  # from all around, from afar and from near, each as it is and as a small, noisy picture shows it
 SIDE_PX = 256  # of a view
 SMALL_PX, NOISE = 100, 0.01  # sides of a small picture, and its noise
 PER_VIEW = 250  # places in each view: the surest ones
@@ -28,7 +28,9 @@ FACES = 12  # that have about as many landmarks among the first ones
 OFTEN = 3  # a landmark is found in so many pictures, or it is not kept
 RANGE = 4.0  # of the camera, in half diagonals of the object, between these ranges (m)
 NEAREST_M, FARTHEST_M = 0.2, 2.0
-FILLED = 0.92  # of the view: the ball around the object
+FILLED = 0.92  # of the view from afar: the ball around the object
+NEAR, NEAR_M = 1.7, 0.06  # half diagonals, or so far from the ball around the object: where a near camera is
+NEAR_TANGENT = 0.42  # of half the angle of a near view: about that of the camera
 BORDER_PX = 2  # so far from the outline the depth is that of the surface
 BEHIND = 0.5  # grey
 TRIED, TRIED_PX, TRIED_NOISE = 15, 80, 0.02  # pictures in which landmarks are looked for again, sides, and noise
@@ -46,18 +48,19 @@ def landmarks_from(mesh: Mesh, features: LocalFeatures, count: int = VIEWS) -> L
     """The landmarks of a mesh in `count` views. Raises SaccadeError if OpenGL does not work."""
     world = World((mesh,), size_px=SIDE_PX)
     world.show_table(False)
-    radius = float(np.linalg.norm(mesh.size_m)) / 2
-    range_m = float(np.clip(RANGE * radius, max(NEAREST_M, 1.5 * radius), max(FARTHEST_M, 1.5 * radius)))
-    focal = FILLED * SIDE_PX / 2 * np.sqrt((range_m / radius) ** 2 - 1)
-    intrinsics = (focal, focal, SIDE_PX / 2, SIDE_PX / 2)
-    world.set_intrinsics(intrinsics)
     world.place({mesh.name: (np.zeros(3), 0.0)})
+    radius = float(np.linalg.norm(mesh.size_m)) / 2
+    far_m = float(np.clip(RANGE * radius, max(NEAREST_M, 1.5 * radius), max(FARTHEST_M, 1.5 * radius)))
+    far_focal = FILLED * SIDE_PX / 2 * np.sqrt((far_m / radius) ** 2 - 1)
     rng, views = np.random.default_rng(0), []
-    for towards in fibonacci_sphere(count):
-        camera = look_at(range_m * towards, np.zeros(3))
-        views += _views(world, mesh.name, camera, intrinsics, features, rng)
+    for range_m, focal in ((max(NEAR * radius, radius + NEAR_M), SIDE_PX / 2 / NEAR_TANGENT), (far_m, far_focal)):
+        intrinsics = (focal, focal, SIDE_PX / 2, SIDE_PX / 2)
+        world.set_intrinsics(intrinsics)
+        for towards in fibonacci_sphere(count):
+            camera = look_at(range_m * towards, np.zeros(3))
+            views += _views(world, mesh.name, camera, intrinsics, features, rng)
     landmarks = merged(views, TOGETHER_PX * 2 * radius / (FILLED * SIDE_PX))
-    usual = _found_again(world, LandmarkFit(landmarks), focal, range_m, features)
+    usual = _found_again(world, LandmarkFit(landmarks), far_focal, far_m, features)
     world.close()
     return replace(landmarks, usual=usual)
 
