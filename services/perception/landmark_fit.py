@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ ALIKE = 0.7  # the least product of two descriptors that may be the same landmar
 VOTING_FEATURES, VOTING_LANDMARKS = 300, 2_000  # the surest, which vote for an object
 VOTE = 0.8  # what is more alike than this counts as a vote, by how much
 FEWEST = 6  # landmarks that must be seen where they should be
+CHECKED = 12  # landmarks that agree: with fewer a pose is not checked, and does not count as confirmed
 SIDES_TRIED = 2  # sides of an object that are tried
 NEAR_RAD = 1.0  # landmarks seen from within this of a tried side count with it
 SEEN_RAD = 1.1  # an object is seen from within this of where the landmarks that agree were seen from
@@ -35,11 +36,16 @@ Array = NDArray[np.float64]
 @dataclass(frozen=True)
 class Fit:
     """A pose of an object, camera_from_object [4, 4], and how many landmarks are where it says, of how many that might
-    be. The camera is that of the crop."""
+    be. The camera is that of the crop.
+
+    Some landmarks always agree on something by chance. `confirmed` landmarks are where poses say that were found
+    without them: this is about as many where the pose is right, and hardly any where it is not.
+    """
 
     camera_from_object: Array
     inliers: int
     matches: int
+    confirmed: int = 0
 
 
 class LandmarkFit:
@@ -73,25 +79,37 @@ class LandmarkFit:
         votes = around[:, _mutual(alike)[1]].sum(1)
         camera = {"model": "SIMPLE_PINHOLE", "width": side_px, "height": side_px,
                   "params": [focal_px, side_px / 2, side_px / 2]}
-        best: Fit | None = None
+        best: tuple[Fit, Array, NDArray[np.int64]] | None = None
         for side in votes.topk(SIDES_TRIED).indices.tolist():
             near = torch.nonzero(around[side])[:, 0]
             rows, which = _mutual(alike[:, near])
-            fit = self._fit(found.pixels[rows].double().numpy(), near[which].numpy(), camera)
-            if fit and (best is None or fit.inliers > best.inliers):
-                best = fit
-        return best
+            pixels, shown = found.pixels[rows].double().numpy(), near[which].numpy()
+            fit = self._fit(pixels, shown, camera)
+            if fit and (best is None or fit.inliers > best[0].inliers):
+                best = fit, pixels, shown
+        if best is None:
+            return None
+        fit, pixels, shown = best
+        return fit if fit.inliers < CHECKED else replace(fit, confirmed=self._confirmed(pixels, shown, camera))
+
+    def _confirmed(self, pixels: Array, which: NDArray[np.int64], camera: dict[str, Any]) -> int:
+        """How many of the landmarks `which` [M], in two halves, are where the pose that the other half tells puts them."""
+        count, most = 0, ERROR * camera["width"]
+        first = np.arange(len(which)) % 2 == 0
+        for told_by in (first, ~first):
+            pose_told, _ = _agreed(pixels[told_by], self.points_m[which[told_by]], camera)
+            right, up, back = pose_told[:3, :3] @ self.points_m[which[~told_by]].T + pose_told[:3, 3:]
+            ahead = np.maximum(-back, 1e-6)
+            seen = camera["width"] / 2 + camera["params"][0] * np.stack([right / ahead, -up / ahead], 1)
+            off = np.linalg.norm(seen - pixels[~told_by], axis=1)
+            count += int(((off < most) & (back < 0)).sum())
+        return count
 
     def _fit(self, pixels: Array, which: NDArray[np.int64], camera: dict[str, Any]) -> Fit | None:
         """The pose that most of the landmarks `which` [M] agree on, if they are seen at `pixels` [M, 2]."""
-        import poselib
-
         if len(which) < FEWEST:
             return None
-        ransac = {**RANSAC, "max_reproj_error": ERROR * camera["width"]}
-        told, info = poselib.estimate_absolute_pose(pixels, self.points_m[which], camera, ransac, {})
-        agree = np.array(info["inliers"], dtype=bool)
-        fitted = pose(OPENGL_FROM_OPENCV @ told.R, OPENGL_FROM_OPENCV @ told.t)
+        fitted, agree = _agreed(pixels, self.points_m[which], camera)
         if agree.sum() < FEWEST or not self._fills(fitted, camera):
             return None
         if seen_from(fitted) @ unit(self.towards[which[agree]].sum(0)) < np.cos(SEEN_RAD):
@@ -105,6 +123,15 @@ class LandmarkFit:
         if back >= 0.0 or np.hypot(right, up) > -back * half:
             return False
         return abs(np.log(self.radius_m / (-back * half * FILLED))) < SIZE
+
+
+def _agreed(pixels: Array, points_m: Array, camera: dict[str, Any]) -> tuple[Array, NDArray[np.bool_]]:
+    """The pose [4, 4] that most of the points [M, 3] agree on which are seen at `pixels` [M, 2], and which do [M]."""
+    import poselib
+
+    ransac = {**RANSAC, "max_reproj_error": ERROR * camera["width"]}
+    told, info = poselib.estimate_absolute_pose(pixels, points_m, camera, ransac, {})
+    return pose(OPENGL_FROM_OPENCV @ told.R, OPENGL_FROM_OPENCV @ told.t), np.array(info["inliers"], dtype=bool)
 
 
 def seen_from(camera_from_object: Array) -> Array:

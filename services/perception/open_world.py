@@ -165,7 +165,7 @@ class OpenWorld:
 
     def found(self, pairs: list[tuple[int, int, int]], fits: Mapping[tuple[int, int], Fit]) -> tuple[Tensor, Tensor]:
         """How many landmarks fit for each of the pairs (object, thing, view), and how many are usual for the object."""
-        count = [fits[k, thing].inliers if (k, thing) in fits else 0 for k, thing, _ in pairs]
+        count = [fits[k, thing].confirmed if (k, thing) in fits else 0 for k, thing, _ in pairs]
         usual = [self.banks[k].landmarks.usual for k, _, _ in pairs]
         return torch.tensor(count, dtype=torch.float32), torch.tensor(usual)
 
