@@ -93,7 +93,7 @@ class LandmarkFit:
         return fit if fit.inliers < CHECKED else replace(fit, confirmed=self._confirmed(pixels, shown, camera))
 
     def _confirmed(self, pixels: Array, which: NDArray[np.int64], camera: dict[str, Any]) -> int:
-        """How many of the landmarks `which` [M], in two halves, are where the pose that the other half tells puts them."""
+        """How many of the landmarks `which` [M], in two halves, are where the pose by the other half puts them."""
         count, most = 0, ERROR * camera["width"]
         first = np.arange(len(which)) % 2 == 0
         for told_by in (first, ~first):

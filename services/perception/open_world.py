@@ -7,8 +7,9 @@ manifest says "architecture": "open".
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -37,6 +38,10 @@ GRAIN_PX = 16  # its sides are multiples of this
 APART_RAD = 0.6  # views farther apart than this are compared separately
 CANDIDATES = 2  # things that are compared with each object, and views of each object that are compared with a thing
 MASK_PX = 60
+NEAR = 0.3  # of the image that things fill, from which on one may be nearer than the image is large
+CERTAIN = 20  # landmarks; where so many confirm what a thing is, it is nothing else
+TWINS = 0.1  # of a similarity: an object that is nearly as like may be a twin of what was found
+KEPT = 500  # pictures that are kept unpacked, of 16 kB each
 SHARPNESS = 20.0  # of the similarities, where it is told how an object is turned
 LIKE_SOMETHING = 0.23  # a normalised similarity; a thing that is less like everything is rolled
 ROLLS_RAD = 2 * np.pi / 8 * np.arange(8)  # in which a thing is tried that is like nothing as it stands
@@ -76,23 +81,25 @@ class OpenWorld:
         self.search = LandmarkSearch(features, self.fits)
         self.many = float(np.log(max(len(banks) / OBJECTS, 1.0)))  # a thing is each of many more seldom
         self.likest = [cohort.likest(vectors) for vectors in self.vectors]
+        self._image = lru_cache(KEPT)(lambda k, view: banks[k].image(view))  # an agent sees the same views again
 
     @torch.inference_mode()
     def see(self, rgb: NDArray[np.uint8], intrinsics_px: ArrayLike, up: ArrayLike,
             depth_m: NDArray[np.float32] | None = None, *, alone: bool = False) -> Seen:
         """Infers all objects from an image [H, W, 3]. `up` [3] is the direction of up in the camera's frame. The depth
         is not used. In an image that stands `alone`, landmarks are searched for in everything, in any roll."""
-        things = self.things(rgb, intrinsics_px, up, whole=True)
+        things = self.things(rgb, intrinsics_px, up, whole=0.0 if alone else NEAR)
         count = len(self.banks)
         seen = _nothing(count, rgb.shape)
         found = self.search(things, ROLLS_RAD.tolist()) if alone else {}
         things, similar = self.rolled_things(things, found)
-        pairs = [pair for k in range(count) for pair in self._candidates(k, similar[k], found)]
+        pairs = [pair for k in range(count) for pair in self._candidates(k, similar[k], found, whole=things.whole)]
+        fits = self.fitted(things, {(k, thing) for k, thing, _ in pairs}, found, similar, quick=not alone)
+        pairs = _left(pairs, fits, similar)
         known = torch.stack([self.view(k, view) for k, _, view in pairs])
         compared = Compared(self.comparison(things.crops[[thing for _, thing, _ in pairs]], known))
         masks = F.interpolate(things.masks[:, None], size=(MASK_PX, MASK_PX), mode="bilinear")[:, 0] > 0.5
         alike = torch.stack([similar[k][thing, view] for k, thing, view in pairs])
-        fits = self.fitted(things, {(k, thing) for k, thing, _ in pairs}, found, quick=not alone)
         odds = self.log_odds(alike, compared.same, *self.found(pairs, fits)).double().numpy() - self.many
         for k, match in enumerate(self._matches(pairs, odds, fits)):
             seen.presence[k] = match.presence
@@ -149,14 +156,20 @@ class OpenWorld:
 
     @torch.inference_mode()
     def fitted(self, things: Things, pairs: Collection[tuple[int, int]],
-               found: Mapping[int, Found] | None = None, *, quick: bool = True) -> dict[tuple[int, int], Fit]:
+               found: Mapping[int, Found] | None = None, similar: Sequence[Tensor] | None = None, *,
+               quick: bool = True) -> dict[tuple[int, int], Fit]:
         """How the landmarks of objects fit things, for those of the `pairs` (object, thing) where enough do. What was
-        `found` is not fitted again."""
+        `found` is not fitted again. By the similarities to the objects' views, `similar`, the likest objects come
+        first, and where it is clear what a thing is, the others that are not nearly as like are left out."""
         fits = {(each.object, thing): each.fit for thing, each in (found or {}).items()}
         left = sorted(set(pairs) - fits.keys())
+        if similar is not None:
+            left.sort(key=lambda pair: -_likeness(similar, *pair))
         wanted = sorted({thing for _, thing in left})
         seen = dict(zip(wanted, self.features(things.fine[wanted], FEATURES) if wanted else [], strict=True))
         for k, thing in left:
+            if similar is not None and not _may_be(k, thing, fits, similar):
+                continue
             half = float(things.window.half_tangent[thing])
             fit = self.fits[k](seen[thing], FINE_PX / 2 / half, FINE_PX, quick=quick)
             if fit is not None:
@@ -171,16 +184,18 @@ class OpenWorld:
 
     def view(self, k: int, view: int) -> Tensor:
         """A view of a bank [4, 64, 64] from 0 to 1."""
-        return torch.from_numpy(self.banks[k].image(view).copy()).permute(2, 0, 1).float() / 255.0
+        return torch.from_numpy(self._image(k, view)).permute(2, 0, 1).float() / 255.0
 
-    def _candidates(self, k: int, similar: Tensor, found: Mapping[int, Found]) -> list[tuple[int, int, int]]:
+    def _candidates(self, k: int, similar: Tensor, found: Mapping[int, Found], *, whole: bool) -> \
+            list[tuple[int, int, int]]:
         """Which things are compared with object k, and with which of its views: (object, thing, view). Things are like
-        it by `similar` [P, V], or it was found there, or they are the whole image, the last one: what is near fills
+        it by `similar` [P, V], or it was found there, or they are the `whole` image, the last one: what is near fills
         it."""
         directions = self.banks[k].directions
         likest = similar.max(1).values.topk(min(CANDIDATES, len(similar))).indices.tolist()
         pairs = []
-        for thing in sorted({*likest, len(similar) - 1, *(n for n, each in found.items() if each.object == k)}):
+        last = {len(similar) - 1} if whole else set()
+        for thing in sorted({*likest, *last, *(n for n, each in found.items() if each.object == k)}):
             left = similar[thing].clone()
             for _ in range(CANDIDATES):
                 view = int(left.argmax())
@@ -207,8 +222,9 @@ class OpenWorld:
 
     @torch.inference_mode()
     def things(self, rgb: NDArray[np.uint8], intrinsics_px: ArrayLike, up: ArrayLike, *,
-               whole: bool = False) -> Things:
-        """Finds the things in an image, and cuts them out. The `whole` image may be one more thing."""
+               whole: float | None = None) -> Things:
+        """Finds the things in an image, and cuts them out. The whole image is one more thing where nothing else is
+        found, or where things fill more than the share `whole` of it."""
         image = torch.from_numpy(np.array(rgb)).permute(2, 0, 1).float() / 255.0
         height, width = rgb.shape[:2]
         share = INPUT_PX / max(height, width)
@@ -216,9 +232,11 @@ class OpenWorld:
         small = F.interpolate(image[None], size=size, mode="area" if share < 1 else "bilinear")
         foreground, votes = self.proposer(small.contiguous(memory_format=torch.channels_last))
         found = propose(foreground[0], votes[0])
-        if whole:
+        is_whole = whole is not None and (not len(found) or float(foreground.sigmoid().mean()) > whole)
+        if is_whole:
             found = with_whole(found, foreground[0])
-        return self._cut(image, found, width / size[1], height / size[0], intrinsics_px, up)
+        things = self._cut(image, found, width / size[1], height / size[0], intrinsics_px, up)
+        return replace(things, whole=is_whole)
 
     def _cut(self, image: Tensor, found: Proposals, right: float, down: float, intrinsics_px: ArrayLike,
              up: ArrayLike) -> Things:
@@ -235,6 +253,25 @@ class OpenWorld:
         crops, masks = cropper.cut(window)
         return Things(torch.cat([crops, masks], 1), cropper.fine(window, FINE_PX), window, found.masks,
                       np.zeros(len(found)))
+
+
+def _likeness(similar: Sequence[Tensor], k: int, thing: int) -> float:
+    return float(similar[k][thing].max())
+
+
+def _may_be(k: int, thing: int, fits: Mapping[tuple[int, int], Fit], similar: Sequence[Tensor]) -> bool:
+    """Whether a thing may be object k, by what its landmarks say of other objects. Twins are nearly as like."""
+    clear = [other for (other, where), fit in fits.items() if where == thing and fit.confirmed >= CERTAIN]
+    return not clear or k in clear or any(
+        _likeness(similar, k, thing) > _likeness(similar, other, thing) - TWINS for other in clear)
+
+
+def _left(pairs: list[tuple[int, int, int]], fits: Mapping[tuple[int, int], Fit], similar: Sequence[Tensor]) -> \
+        list[tuple[int, int, int]]:
+    """The pairs (object, thing, view) that are worth a comparison: at least one of each object."""
+    left = [pair for pair in pairs if _may_be(pair[0], pair[1], fits, similar)]
+    told = {k for k, _, _ in left}
+    return sorted(left + [next(pair for pair in pairs if pair[0] == k) for k in range(len(similar)) if k not in told])
 
 
 def _nothing(count: int, shape: tuple[int, ...]) -> Seen:

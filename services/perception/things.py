@@ -20,13 +20,14 @@ FINE_PX = 256  # side of the crops in which local features are found
 class Things:
     """P things that were proposed: their crops with masks [P, 4, 64, 64] and the windows of these, finer crops without
     masks [P, 3, 256, 256], and their masks in the image [P, h, w]. The crops are rolled by the angles `roll` [P]
-    (rad)."""
+    (rad). The last thing may be the `whole` image."""
 
     crops: Tensor
     fine: Tensor
     window: Window
     masks: Tensor
     roll: NDArray[np.float64]
+    whole: bool = False
 
 
 @dataclass(frozen=True)
