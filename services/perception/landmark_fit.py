@@ -27,7 +27,8 @@ NEAR_RAD = 1.0  # landmarks seen from within this of a tried side count with it
 SEEN_RAD = 1.1  # an object is seen from within this of where the landmarks that agree were seen from
 SIZE = 0.8  # logarithm of how much larger or smaller than its crop says an object may be
 ERROR = 0.013  # so far from where it should be a landmark may be seen: a share of the crop's side
-RANSAC = {"max_iterations": 500, "min_iterations": 30, "seed": 0}
+LOOSE = 1.5  # times so far where the pose is told by half of the landmarks
+TRIES, TRIES_CHECKED = 500, 5_000  # poses that are tried, and where half of the landmarks tells one
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0])
 
 Array = NDArray[np.float64]
@@ -39,13 +40,18 @@ class Fit:
     be. The camera is that of the crop.
 
     Some landmarks always agree on something by chance. `confirmed` landmarks are where poses say that were found
-    without them: this is about as many where the pose is right, and hardly any where it is not.
+    without them: these are about as many where the pose is right, and fewer where it is not.
     """
 
     camera_from_object: Array
     inliers: int
     matches: int
     confirmed: int = 0
+
+    @property
+    def support(self) -> float:
+        """How many landmarks speak for the pose: the mean of those that agree and of those that confirm it."""
+        return (self.inliers + self.confirmed) / 2
 
 
 class LandmarkFit:
@@ -94,10 +100,10 @@ class LandmarkFit:
 
     def _confirmed(self, pixels: Array, which: NDArray[np.int64], camera: dict[str, Any]) -> int:
         """How many of the landmarks `which` [M], in two halves, are where the pose by the other half puts them."""
-        count, most = 0, ERROR * camera["width"]
+        count, most = 0, LOOSE * ERROR * camera["width"]
         first = np.arange(len(which)) % 2 == 0
         for told_by in (first, ~first):
-            pose_told, _ = _agreed(pixels[told_by], self.points_m[which[told_by]], camera)
+            pose_told, _ = _agreed(pixels[told_by], self.points_m[which[told_by]], camera, TRIES_CHECKED)
             right, up, back = pose_told[:3, :3] @ self.points_m[which[~told_by]].T + pose_told[:3, 3:]
             ahead = np.maximum(-back, 1e-6)
             seen = camera["width"] / 2 + camera["params"][0] * np.stack([right / ahead, -up / ahead], 1)
@@ -109,7 +115,7 @@ class LandmarkFit:
         """The pose that most of the landmarks `which` [M] agree on, if they are seen at `pixels` [M, 2]."""
         if len(which) < FEWEST:
             return None
-        fitted, agree = _agreed(pixels, self.points_m[which], camera)
+        fitted, agree = _agreed(pixels, self.points_m[which], camera, TRIES)
         if agree.sum() < FEWEST or not self._fills(fitted, camera):
             return None
         if seen_from(fitted) @ unit(self.towards[which[agree]].sum(0)) < np.cos(SEEN_RAD):
@@ -125,11 +131,12 @@ class LandmarkFit:
         return abs(np.log(self.radius_m / (-back * half * FILLED))) < SIZE
 
 
-def _agreed(pixels: Array, points_m: Array, camera: dict[str, Any]) -> tuple[Array, NDArray[np.bool_]]:
-    """The pose [4, 4] that most of the points [M, 3] agree on which are seen at `pixels` [M, 2], and which do [M]."""
+def _agreed(pixels: Array, points_m: Array, camera: dict[str, Any], tries: int) -> tuple[Array, NDArray[np.bool_]]:
+    """The pose [4, 4] that most of the points [M, 3] agree on which are seen at `pixels` [M, 2], of so many tries, and
+    which do [M]."""
     import poselib
 
-    ransac = {**RANSAC, "max_reproj_error": ERROR * camera["width"]}
+    ransac = {"max_iterations": tries, "min_iterations": 30, "seed": 0, "max_reproj_error": ERROR * camera["width"]}
     told, info = poselib.estimate_absolute_pose(pixels, points_m, camera, ransac, {})
     return pose(OPENGL_FROM_OPENCV @ told.R, OPENGL_FROM_OPENCV @ told.t), np.array(info["inliers"], dtype=bool)
 

@@ -38,7 +38,7 @@ class LandmarkSearch:
     def __call__(self, things: Things, rolls: Sequence[float]) -> dict[int, Found]:
         """What was found for sure, by the number of the thing."""
         best = {thing: self._best(things, thing, rolls) for thing in range(len(things.fine))}
-        return {thing: found for thing, found in best.items() if found is not None and found.fit.confirmed >= SURE}
+        return {thing: found for thing, found in best.items() if found is not None and found.fit.support >= SURE}
 
     def _best(self, things: Things, thing: int, rolls: Sequence[float]) -> Found | None:
         """What fits a thing best. In which rolls which objects are fitted, is elected by votes."""

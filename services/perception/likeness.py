@@ -10,7 +10,7 @@ from torch import Tensor
 
 COHORT, LIKEST = "cohort", 50  # name of the cohort's file, and how many of its views count
 OBJECTS = 5  # that are known where the log odds are fitted
-SURE, UNSURE = 10.0, 2.0  # landmarks
+SURE, UNSURE = 16.0, 1.5  # landmarks
 UNIT = 0.05  # about the standard deviation of the largest similarities, so that normalised ones are as large as others
 
 
@@ -38,7 +38,7 @@ def log_odds(factors: Iterable[float] | Tensor, similar: Tensor, same: Tensor, f
 
 
 def sure_of(found: Tensor) -> Tensor:
-    """How sure it is (0 to 1) that a pose is right which so many landmarks confirm."""
+    """How sure it is (0 to 1) that a pose is right for which so many landmarks speak."""
     return torch.sigmoid((found - SURE) / UNSURE)
 
 

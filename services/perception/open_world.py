@@ -39,7 +39,7 @@ APART_RAD = 0.6  # views farther apart than this are compared separately
 CANDIDATES = 2  # things that are compared with each object, and views of each object that are compared with a thing
 MASK_PX = 60
 NEAR = 0.3  # of the image that things fill, from which on one may be nearer than the image is large
-CERTAIN = 20  # landmarks; where so many confirm what a thing is, it is nothing else
+CERTAIN = 25  # landmarks; where so many speak for what a thing is, it is nothing else
 TWINS = 0.1  # of a similarity: an object that is nearly as like may be a twin of what was found
 KEPT = 500  # pictures that are kept unpacked, of 16 kB each
 SHARPNESS = 20.0  # of the similarities, where it is told how an object is turned
@@ -178,7 +178,7 @@ class OpenWorld:
 
     def found(self, pairs: list[tuple[int, int, int]], fits: Mapping[tuple[int, int], Fit]) -> tuple[Tensor, Tensor]:
         """How many landmarks fit for each of the pairs (object, thing, view), and how many are usual for the object."""
-        count = [fits[k, thing].confirmed if (k, thing) in fits else 0 for k, thing, _ in pairs]
+        count = [fits[k, thing].support if (k, thing) in fits else 0.0 for k, thing, _ in pairs]
         usual = [self.banks[k].landmarks.usual for k, _, _ in pairs]
         return torch.tensor(count, dtype=torch.float32), torch.tensor(usual)
 
@@ -261,7 +261,7 @@ def _likeness(similar: Sequence[Tensor], k: int, thing: int) -> float:
 
 def _may_be(k: int, thing: int, fits: Mapping[tuple[int, int], Fit], similar: Sequence[Tensor]) -> bool:
     """Whether a thing may be object k, by what its landmarks say of other objects. Twins are nearly as like."""
-    clear = [other for (other, where), fit in fits.items() if where == thing and fit.confirmed >= CERTAIN]
+    clear = [other for (other, where), fit in fits.items() if where == thing and fit.support >= CERTAIN]
     return not clear or k in clear or any(
         _likeness(similar, k, thing) > _likeness(similar, other, thing) - TWINS for other in clear)
 

@@ -43,7 +43,7 @@ class Placed:
         self.pixel_std = float(shift_std * half * np.asarray(intrinsics_px)[0])
         self.sure, self.fitted = 0.0, np.eye(3)
         if match.fit is not None:
-            self.sure = float(sure_of(torch.tensor(float(match.fit.confirmed))))
+            self.sure = float(sure_of(torch.tensor(match.fit.support)))
             turn = np.eye(3)
             turn[:2, :2] = turn_of(-as_cut).T
             camera = rotation @ turn
