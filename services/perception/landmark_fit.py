@@ -22,7 +22,8 @@ VOTING_FEATURES, VOTING_LANDMARKS = 300, 2_000  # the surest, which vote for an 
 VOTE = 0.8  # what is more alike than this counts as a vote, by how much
 FEWEST = 6  # landmarks that must be seen where they should be
 CHECKED = 12  # landmarks that agree: with fewer a pose is not checked, and does not count as confirmed
-SIDES_TRIED = 2  # sides of an object that are tried
+SIDES_TRIED, QUICK_SIDES = 4, 2  # sides of an object that are tried
+APART_RAD = 0.7  # sides that are tried lie so far from one another
 NEAR_RAD = 1.0  # landmarks seen from within this of a tried side count with it
 SEEN_RAD = 1.1  # an object is seen from within this of where the landmarks that agree were seen from
 SIZE = 0.8  # logarithm of how much larger or smaller than its crop says an object may be
@@ -61,6 +62,7 @@ class LandmarkFit:
         self.points_m = landmarks.points_m.astype(np.float64)
         self.descriptors = torch.from_numpy(landmarks.descriptors)
         directions, seen = landmarks.directions, landmarks.seen
+        self.apart = directions @ directions.T < np.cos(APART_RAD)  # [SIDES, SIDES]
         self.around = torch.from_numpy(directions @ directions.T > np.cos(NEAR_RAD)).float() @ \
             torch.from_numpy(seen).float() > 0  # [SIDES, N]: the landmarks that are seen from near a side
         self.towards = seen.T @ directions  # [N, 3]: from where a landmark is seen, not of unit length
@@ -86,7 +88,7 @@ class LandmarkFit:
         camera = {"model": "SIMPLE_PINHOLE", "width": side_px, "height": side_px,
                   "params": [focal_px, side_px / 2, side_px / 2]}
         best: tuple[Fit, Array, NDArray[np.int64]] | None = None
-        for side in votes.topk(SIDES_TRIED).indices.tolist():
+        for side in self._tried(votes.numpy(), QUICK_SIDES if quick else SIDES_TRIED):
             near = torch.nonzero(around[side])[:, 0]
             rows, which = _mutual(alike[:, near])
             pixels, shown = found.pixels[rows].double().numpy(), near[which].numpy()
@@ -97,6 +99,14 @@ class LandmarkFit:
             return None
         fit, pixels, shown = best
         return fit if fit.inliers < CHECKED else replace(fit, confirmed=self._confirmed(pixels, shown, camera))
+
+    def _tried(self, votes: Array, count: int) -> list[int]:
+        """The sides with the most of the votes [SIDES], which are not near one another."""
+        votes, sides = votes.copy(), list[int]()
+        while len(sides) < count and votes.max() > 0:
+            sides.append(int(votes.argmax()))
+            votes[~self.apart[sides[-1]]] = 0
+        return sides
 
     def _confirmed(self, pixels: Array, which: NDArray[np.int64], camera: dict[str, Any]) -> int:
         """How many of the landmarks `which` [M], in two halves, are where the pose by the other half puts them."""

@@ -39,6 +39,7 @@ APART_RAD = 0.6  # views farther apart than this are compared separately
 CANDIDATES = 2  # things that are compared with each object, and views of each object that are compared with a thing
 MASK_PX = 60
 NEAR = 0.3  # of the image that things fill, from which on one may be nearer than the image is large
+SURELY = 0.9  # the presence that counts as sure
 CERTAIN = 25  # landmarks; where so many speak for what a thing is, it is nothing else
 TWINS = 0.1  # of a similarity: an object that is nearly as like may be a twin of what was found
 KEPT = 500  # pictures that are kept unpacked, of 16 kB each
@@ -205,7 +206,8 @@ class OpenWorld:
 
     def _matches(self, pairs: list[tuple[int, int, int]], log_odds: Array,
                  fits: Mapping[tuple[int, int], Fit]) -> list[Match]:
-        """Where each object is likeliest. A thing is one object, or none of them: `log_odds` are those against none."""
+        """Where each object is likeliest. A thing is one object, or none of them: `log_odds` are those against none.
+        Where an object is sure to be in several things, as in the whole image and in a part of it, landmarks decide."""
         odds = np.exp(np.clip(log_odds, -30, 30))
         best: dict[tuple[int, int], int] = {}  # the row of the likeliest view of each object in each thing
         for row, (k, thing, _) in enumerate(pairs):
@@ -216,7 +218,9 @@ class OpenWorld:
             total[thing] = total.get(thing, 1.0) + float(odds[row])
         matches = []
         for k in range(len(self.banks)):
-            presence, thing, row = max((float(odds[r]) / total[t], t, r) for (o, t), r in best.items() if o == k)
+            seen = [(float(odds[r]) / total[t], t, r) for (o, t), r in best.items() if o == k]
+            support = {t: fits[k, t].support if (k, t) in fits else 0.0 for _, t, _ in seen}
+            presence, thing, row = max(seen, key=lambda each: (min(each[0], SURELY), support[each[1]], each[0]))
             matches.append(Match(thing, presence, pairs[row][2], row, fits.get((k, thing))))
         return matches
 
