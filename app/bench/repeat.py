@@ -13,7 +13,8 @@ from saccade.app.bench.bench import MAX_FILE_BYTES, RECORD_KEYS, RUN, SCENES_END
 from saccade.app.bench.suites import SUITES, suite_file
 from saccade.app.look.picture import Story
 from saccade.app.run.registry import weight_hashes
-from saccade.services.simulator.scenes import MAX_ID, Scene, load_scenes
+from saccade.services.simulator.fields import MAX_ID
+from saccade.services.simulator.scenes import Scene, load_scenes
 from saccade.shared.bus.messages import Message
 from saccade.shared.bus.topics import Topic
 from saccade.shared.config import PACKAGE, Config, validate
