@@ -56,18 +56,19 @@ def test_no_move_runs_through_anything():
 
 def test_a_free_move_is_carried_out_exactly():
     space = Space(REACH, WALL)
-    np.testing.assert_array_equal(space.moved(LEFT, LEFT + [0.0, 0.3, 0.1]), LEFT + [0.0, 0.3, 0.1])
+    there = np.array([-0.3, 0.3, 0.4])
+    np.testing.assert_array_equal(space.moved(LEFT, there), there)
 
 
 def test_it_slides_along_what_is_in_the_way():
-    there = Space(REACH, WALL).moved(LEFT, RIGHT + [0.0, 0.3, 0.0])
+    there = Space(REACH, WALL).moved(LEFT, np.array([0.3, 0.3, 0.3]))
     assert there[0] == pytest.approx(-0.02 - CLEARANCE_M, abs=1e-5)
     assert there[1] > 0.2
 
 
 def test_a_camera_gives_way_to_what_stands_at_its_place_now():
     box = Boxes(LEFT[None], np.eye(3)[None], np.full((1, 3), 0.1))
-    there = Space(REACH, box).moved(LEFT, LEFT + [0.0, 0.01, 0.0])
+    there = Space(REACH, box).moved(LEFT, np.array([-0.3, 0.01, 0.3]))
     assert Space(REACH, box).allows(there)
 
 
@@ -101,7 +102,7 @@ def test_a_way_leads_around_a_wall():
 
 def test_the_nearer_of_several_goals_is_taken():
     space = Space(REACH, SHORT_WALL)
-    way, goal = find_way(space, LEFT, [RIGHT, LEFT + [0.0, 0.2, 0.1]])
+    way, goal = find_way(space, LEFT, [RIGHT, np.array([-0.3, 0.2, 0.4])])
     assert (goal, len(way)) == (1, 2)
 
 
