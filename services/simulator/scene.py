@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from saccade.shared.wording import label_of
 from saccade.shared.world.geometry import Array, pose, quaternion, rotation_of, yaw_rotation
-from saccade.shared.world.workspace import Boxes, Reach
+from saccade.shared.world.workspace import TABLE_THICK_M, Boxes, Reach
 
 EventKind = Literal["moved", "taken", "put_back", "pushed_over", "drifts"]
 Quaternion = tuple[float, float, float, float]  # x, y, z, w
@@ -69,6 +69,9 @@ class Table:
 
     size_xy_m: tuple[float, float]
     height_m: float = 0.0
+
+
+PAPER_TABLE = Table((1.0, 1.0))
 
 
 @dataclass(frozen=True)
@@ -178,9 +181,10 @@ class Scene:
         """The objects that stand on the table at first."""
         return tuple(p for p in self.objects if not (self.target_absent and p.name == self.target))
 
-
-TABLE_THICK_M = 1.0  # how far a table with a workspace reaches down: the camera does not go below it
-PAPER_TABLE = Table((1.0, 1.0))
+    @property
+    def is_plain(self) -> bool:
+        """Whether it is a scene as the paper's: each object stands upright, is there once, and nothing happens."""
+        return self.workspace is None and not self.events and all(p.upright and p.instance == 1 for p in self.objects)
 
 
 def surroundings(scene: Scene) -> Boxes:

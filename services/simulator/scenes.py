@@ -85,7 +85,7 @@ def generate_scene(rng: np.random.Generator, sizes: Sizes, target: str, n_object
     names = [target, *(others[i] for i in rng.permutation(len(others))[:n_objects - 1])]
     names = [names[i] for i in rng.permutation(n_objects)]
     extents = np.array([sizes[name] for name in names], dtype=np.float64)
-    centers = np.c_[_spread(rng, np.linalg.norm(extents[:, :2], axis=1) / 2), extents[:, 2] / 2]
+    centers = np.c_[spread(rng, np.linalg.norm(extents[:, :2], axis=1) / 2), extents[:, 2] / 2]
     yaws = rng.uniform(-np.pi, np.pi, n_objects) if yaw == "random" else np.zeros(n_objects)
     index = names.index(target)
     goal = draw_goal(rng, centers, extents, index)
@@ -108,8 +108,10 @@ def draw_goal(rng: np.random.Generator, centers_m: ArrayLike, sizes_m: ArrayLike
     return goal
 
 
-def _spread(rng: np.random.Generator, radii_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Draws points xy [N, 2] (metres) whose circles do not overlap. It starts again if an object finds no room.
+def spread(rng: np.random.Generator, radii_m: NDArray[np.float64], half_m: float = HALF_SPREAD_M
+           ) -> NDArray[np.float64]:
+    """Draws points xy [N, 2] (metres) in a square of half the side `half_m` whose circles do not overlap. It starts
+    again if an object finds no room.
 
     Raises SaccadeError if this fails too often.
     """
@@ -117,7 +119,7 @@ def _spread(rng: np.random.Generator, radii_m: NDArray[np.float64]) -> NDArray[n
         points: list[NDArray[np.float64]] = []
         for radius in radii_m:
             for _ in range(_TRIES):
-                point = rng.uniform(-HALF_SPREAD_M, HALF_SPREAD_M, 2)
+                point = rng.uniform(-half_m, half_m, 2)
                 if all(np.linalg.norm(point - p) >= radius + r for p, r in zip(points, radii_m, strict=False)):
                     points.append(point)
                     break

@@ -18,6 +18,7 @@ from saccade.shared.world.geometry import Array, fibonacci_sphere
 
 CLEARANCE_M = 0.06  # how far the camera stays from every surface: about the radius of its own body
 STRIDE_M = 0.01  # a move is checked at points that are so near to one another
+TABLE_THICK_M = 1.0  # a table reaches down so far: the camera does not go below it
 SLACK_M = 1e-6  # numerical slack: a camera that was pushed onto the limit counts as allowed
 _PUSHES = 8  # how often a position is pushed out of what it is in
 _SHELLS_M = np.concatenate([np.arange(0.01, 0.3, 0.01), np.arange(0.3, 2.0, 0.05)])  # where room is searched
