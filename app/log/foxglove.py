@@ -91,15 +91,17 @@ class Scene:
             if truth.episode != self._goal_posed:
                 self._goal_posed = truth.episode
                 yield from self._goal_view(at)
+        turned = truth.rotations if truth.rotations is not None else [
+            Rotation.from_euler("z", yaw).as_matrix() for yaw in truth.yaws_rad]
         yield "/truth/objects", cloud(truth.centers_m, TRUE, 1.0, at)
         yield "/truth/labels", update("objects", at, spheres=[
             fm.SpherePrimitive(pose=pose(np.eye(3), center), size=vector([MARK_M] * 3), color=colour(TRUE))
             for center in truth.centers_m], arrows=[
-            fm.ArrowPrimitive(pose=pose(Rotation.from_euler("z", yaw).as_matrix(), center), color=colour(TRUE, 0.5),
+            fm.ArrowPrimitive(pose=pose(rotation, center), color=colour(TRUE, 0.5),
                               shaft_length=YAW_M, shaft_diameter=0.005, head_length=0.02, head_diameter=0.012)
-            for center, yaw in zip(truth.centers_m, truth.yaws_rad, strict=False)], texts=[
+            for center, rotation in zip(truth.centers_m, turned, strict=False)], texts=[
             label(f"{name} (target)" if name == truth.target else name, center, TRUE)
-            for name, center in zip(truth.names, truth.centers_m, strict=False)])
+            for name, center in zip(truth.labels, truth.centers_m, strict=False)])
         yield from self._way(truth, at)
 
     def _way(self, message: Frame | Truth, at: fm.Timestamp) -> Iterator[Told]:

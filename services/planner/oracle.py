@@ -12,8 +12,8 @@ from saccade.shared.bus.messages import Action, Goal, Truth
 from saccade.shared.bus.topics import ACTION, GOAL, TRUTH, Output
 from saccade.shared.config import Config
 from saccade.shared.loop.service import Inputs, Service
-from saccade.shared.world.geometry import Array
-from saccade.shared.world.task import Spheres, apply_action, clip, success
+from saccade.shared.world.geometry import Array, pose
+from saccade.shared.world.task import SUCCESS_TRANSLATION_M, Spheres, apply_action, clip, success
 from saccade.shared.world.ways import find_way
 from saccade.shared.world.workspace import Boxes, Space
 
@@ -30,6 +30,7 @@ class Oracle:
     def __init__(self, step_m: float = STEP_M):
         self.step_m = step_m
         self._way: Array | None = None
+        self._instance = 0  # of the target to whose view the way leads
 
     def begin(self, run: str, episode: int) -> list[Output]:
         """Forgets the way of the last episode. Nothing is published."""
@@ -59,17 +60,33 @@ class Oracle:
         """The next translation [3] in metres and rotation [3] in radians in a workspace."""
         if truth.target not in truth.names:
             return np.zeros(3), np.zeros(3)
-        here, goal = space.nearest(truth.world_from_camera[:3, 3]), truth.goal_world_from_camera
-        there = space.nearest(goal[:3, 3])
-        if self._way is None or not self._is_free(space, here, there):
-            found = find_way(space, here, [there])
+        here = space.nearest(truth.world_from_camera[:3, 3])
+        goals = self._goals(truth, space)
+        at = goals.get(self._instance)
+        if self._way is None or at is None or not self._is_free(space, here, at[0]):
+            found = find_way(space, here, [eye for eye, _ in goals.values()]) if goals else None
             self._way = None if found is None else found[0][1:]
-        turn = turn_towards(truth.world_from_camera[:3, :3], goal[:3, :3])
+            if found is not None:
+                self._instance = list(goals)[found[1]]
         if self._way is None:
-            return np.zeros(3), turn
+            return np.zeros(3), np.zeros(3)
         while len(self._way) > 1 and space.free(here, self._way[1]):
             self._way = self._way[1:]
+        turn = turn_towards(truth.world_from_camera[:3, :3], goals[self._instance][1])
         return along(np.array([here, *self._way]), self.step_m) - truth.world_from_camera[:3, 3], turn
+
+    def _goals(self, truth: Truth, space: Space) -> dict[int, tuple[Array, Array]]:
+        """For each of the target's kind that has a view like the goal's within reach: the position [3] and the rotation
+        [3, 3] there."""
+        turned, numbers = truth.world_from_objects(), truth.instances
+        assert numbers is not None  # they are told in a workspace
+        poses = {int(numbers[k]): pose(turned[k], truth.centers_m[k]) for k, name in enumerate(truth.names)
+                 if name == truth.target}
+        seen_from = np.linalg.inv(poses[truth.target_instance]) @ truth.goal_world_from_camera
+        views = {number: world_from_object @ seen_from for number, world_from_object in poses.items()}
+        near = {number: (space.nearest(view[:3, 3]), view[:3, :3]) for number, view in views.items()}
+        return {number: goal for number, goal in near.items()
+                if np.linalg.norm(goal[0] - views[number][:3, 3]) < SUCCESS_TRANSLATION_M}
 
     def _is_free(self, space: Space, here: Array, there: Array) -> bool:
         """Whether the rest of the way still leads to the goal's position [3], and nothing stands in it."""

@@ -129,8 +129,8 @@ class Drift:
 class Event:
     """Something that happens to an object during an episode, once.
 
-    When: with `at_step`, or after its object was in view in `after_in_view` images, or `after_previous` steps after the
-    event before it in the list. What is moved, pushed over or put back is then at `to`; without `to` it is put back
+    When: with `at_step`, or `after_in_view` steps after its object was first in view, or `after_previous` steps after
+    the event before it in the list. What is moved, pushed over or put back is then at `to`; without `to` it is put back
     where it was.
     """
 

@@ -3,7 +3,6 @@ and over what was in view, so that an episode that is played again is the same."
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -34,7 +33,7 @@ class Stage:
         self._away: dict[str, Placed] = {}
         self._drifting: dict[str, tuple[Drift, Placed, int]] = {}  # with the step before the first of the drift
         self._fired: list[int | None] = [None] * len(scene.events)
-        self._seen_in: Counter[str] = Counter()
+        self._first_seen: dict[str, int] = {}  # steps
 
     @property
     def objects(self) -> tuple[Placed, ...]:
@@ -69,7 +68,9 @@ class Stage:
 
         Returns what happened, in words, which may be nothing new while an object drifts. None if all stands still.
         """
-        self._seen_in.update(p.label for p, share in zip(self.objects, shares, strict=True) if share >= IN_VIEW)
+        for placed, share in zip(self.objects, shares, strict=True):
+            if share >= IN_VIEW:
+                self._first_seen.setdefault(placed.label, step - 1)
         happened = []
         for k, event in enumerate(self.scene.events):
             if self._fired[k] is None and self._is_due(k, event, step):
@@ -86,7 +87,7 @@ class Stage:
         if event.at_step is not None:
             return step >= event.at_step
         if event.after_in_view is not None:
-            return self._seen_in[event.label] >= event.after_in_view
+            return step >= self._first_seen.get(event.label, step) + event.after_in_view
         before = self._fired[k - 1]
         return before is not None and event.after_previous is not None and step >= before + event.after_previous
 
