@@ -103,12 +103,13 @@ def test_twins(drawn):
 
 
 def test_what_lies_is_at_rest(drawn):
-    """Objects of a scene that fall again from where they are stay where they are; cameras and goals are rolled."""
+    """An object of a scene that is let go where it is stays there; cameras and goals are rolled."""
     for scene in drawn["lying"]:
-        again = at_rest(MESHES, scene.objects)
-        for before, after in zip(scene.objects, again, strict=True):
+        for before in scene.objects:
+            others = [placed for placed in scene.objects if placed is not before]
+            after, = at_rest(MESHES, [before], standing=others)
             assert np.linalg.norm(before.center_m - after.center_m) < 0.006
-            assert rotation_angle(before.rotation, after.rotation) < 0.1
+            assert rotation_angle(before.rotation, after.rotation) < 0.02
         right = scene.start_world_from_camera[:3, 0]
         assert abs(right[2]) > 1e-3
         assert abs(scene.goal_world_from_camera[2, 0]) > 1e-3

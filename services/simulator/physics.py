@@ -7,21 +7,24 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from saccade.services.simulator.scene import PAPER_TABLE, Placed, Table, placed_at
 from saccade.shared.render.mesh import Mesh
+from saccade.shared.render.opengl import choose_backend
 from saccade.shared.world.geometry import Array, fibonacci_sphere, quaternion
+
+choose_backend()  # of the renderer: MuJoCo takes it when it is imported
+import mujoco  # noqa: E402
 
 STEP_S = 0.004
 DENSITY_KG_M3 = 400.0  # of full cans and half-full boxes
 FRICTION = (0.8, 0.01, 0.001)  # sliding, turning, rolling
 BETWEEN = 75  # steps from one object's fall to the next one's
-CHECKED_EVERY, LONGEST = 25, 1500  # steps
-AT_REST = 0.02  # m/s and rad/s
-DRAG_FALLING, DRAG_RESTING = 0.999, 0.95  # a step; after the last one has fallen, what rolls comes to a halt
+CHECKED_EVERY, CHECKS, LONGEST = 25, 4, 2000  # steps between checks, checks that must agree, steps
+AT_REST = 0.01  # m/s and rad/s
+DRAG_FALLING, DRAG_RESTING = 0.999, 0.99  # a step; after the last one has fallen, what rolls comes to a halt
 TABLE_THICK_M = 0.1
 WAITING_M = 50.0  # above the table, and apart from one another
 _DIRECTIONS = fibonacci_sphere(160)
@@ -45,18 +48,20 @@ def at_rest(meshes: Mapping[str, Mesh], falling: Sequence[Placed], *, standing: 
     """Lets objects fall onto the table, one after the other from where they are, among others that stand still.
 
     Each begins at its place, or higher where a heap is in its way. Returns how they come to rest. None if one fell from
-    the table, or if they do not come to rest in 6 s.
+    the table, or if they do not come to rest in 8 s.
     """
     model = _model(meshes, falling, standing, table)
     data = mujoco.MjData(model)
     starts = [np.concatenate([p.center_m, _wxyz(p.rotation)]) for p in falling]
     radii = np.array([np.linalg.norm(meshes[p.name].size_m) / 2 for p in falling])
+    still = 0
     for step in range(len(falling) * BETWEEN + LONGEST):
         fallen = step // BETWEEN + 1
         if step % BETWEEN == 0 and fallen <= len(falling):
             start = starts[fallen - 1]
-            tops = data.qpos.reshape(-1, 7)[:fallen - 1, 2] + radii[:fallen - 1]
-            start[2] = max([start[2], *(tops + radii[fallen - 1])])
+            there, reach = data.qpos.reshape(-1, 7)[:fallen - 1, :3], radii[:fallen - 1] + radii[fallen - 1]
+            below = np.linalg.norm(there[:, :2] - start[:2], axis=1) < reach
+            start[2] = max([start[2], *(there[:, 2] + reach)[below]])
             data.qpos[7 * (fallen - 1):7 * fallen] = start
             data.qvel[6 * (fallen - 1):6 * fallen] = 0.0
         for waiting in range(fallen, len(falling)):
@@ -64,8 +69,10 @@ def at_rest(meshes: Mapping[str, Mesh], falling: Sequence[Placed], *, standing: 
             data.qvel[6 * waiting:6 * waiting + 6] = 0.0
         mujoco.mj_step(model, data)
         data.qvel *= DRAG_FALLING if fallen <= len(falling) else DRAG_RESTING
-        if fallen > len(falling) and step % CHECKED_EVERY == 0 and np.abs(data.qvel).max() < AT_REST:
-            return _placed(data.qpos.reshape(-1, 7), falling, table)
+        if fallen > len(falling) and step % CHECKED_EVERY == 0:
+            still = still + 1 if np.abs(data.qvel).max() < AT_REST else 0
+            if still == CHECKS:
+                return _placed(data.qpos.reshape(-1, 7), falling, table)
     return None
 
 

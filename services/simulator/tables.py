@@ -27,7 +27,7 @@ from saccade.shared.world.workspace import CLEARANCE_M, BoxReach, Reach, ShellRe
 Meshes = Mapping[str, Mesh]
 COUNT = 200  # scenes of a suite
 MOST_DRAWN, MOST_OBSTACLES = 15, 3  # objects, and obstacles, of a scene
-_TRIES, _GOALS = 400, 30  # how often a scene is drawn, and a goal for its objects
+_TRIES, _GOALS, _CROWDED = 400, 30, 3  # how often a scene is drawn, a goal for it, and objects that do not fit
 PAPER_REACH = BoxReach(LOWER_M, UPPER_M)
 HALF_SPREAD_M, HEAP_M, HEAP_EDGE_M = 0.28, 0.07, 0.36
 STEP_M = 0.05  # of an agent: how far it comes before something happens
@@ -40,10 +40,16 @@ def draw_table(kind: str, rng: Generator, meshes: Meshes, target: str, number: i
 
     Raises SaccadeError if the objects do not fit.
     """
+    crowded = 0
     for _ in range(_TRIES):
-        scene = TABLES[kind](rng, meshes, target, number)
+        try:
+            scene = TABLES[kind](rng, meshes, target, number)
+        except SaccadeError:  # they do not fit side by side; fewer or others may
+            scene, crowded = None, crowded + 1
         if scene is not None:
             return replace(scene, id=scene_id)
+        if crowded == _CROWDED:
+            break
     raise SaccadeError(f"a scene of {kind!r} with the target {target!r} does not fit on the table: choose smaller "
                        "objects with --names")
 
