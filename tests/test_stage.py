@@ -184,3 +184,8 @@ def test_another_table_is_higher_and_smaller(world):
     assert (images[0] == images[1]).all()
     assert (images[0] != images[2]).any()
     assert (images[0] != images[3]).any()
+
+
+def test_a_limit_from_outside_holds(world):
+    simulator, _ = play(world, scene(), [(0.1, 0.0, 0.0), (0.1, 0.0, 0.0)], also=lambda points: points[:, 0] < 0.5)
+    assert simulator.state.camera[0, 3] <= 0.5

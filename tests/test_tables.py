@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
+from dataclasses import replace
 from itertools import pairwise
 
 import gymnasium
@@ -16,7 +17,7 @@ from saccade.services.planner.oracle import Oracle
 from saccade.services.simulator.core import Simulator
 from saccade.services.simulator.gym_env import ID
 from saccade.services.simulator.physics import at_rest, height_on
-from saccade.services.simulator.scene import Placed, Table, placed_at
+from saccade.services.simulator.scene import Obstacle, Placed, Table, placed_at
 from saccade.services.simulator.scene_entry import entry_of, scene_from
 from saccade.services.simulator.stage import boxes_around
 from saccade.services.simulator.tables import TABLES, draw_tables
@@ -25,7 +26,7 @@ from saccade.shared.config import Config
 from saccade.shared.errors import SaccadeError
 from saccade.shared.render.look import FLAT
 from saccade.shared.render.objects import PANTRY_NAMES, load_mesh
-from saccade.shared.world.geometry import INTRINSICS_PX, rotation_angle, rotation_xyz
+from saccade.shared.world.geometry import INTRINSICS_PX, look_at, rotation_angle, rotation_xyz
 from saccade.shared.world.task import start_pose
 
 COUNT = 5  # of each kind: one for each target
@@ -77,6 +78,18 @@ def test_the_oracle_solves_it_and_runs_through_nothing(drawn, kind):
             boxes = boxes_around([placed_at(n, 1, c, r) for n, c, r in zip(
                 truth.names, truth.centers_m, truth.world_from_objects(), strict=True)], SIZES)
             assert boxes.distances_m(truth.world_from_camera[:3, 3]).min() > 0.0599
+
+
+def test_where_no_way_leads_to_the_goal_the_oracle_stays_where_it_is(drawn):
+    """A wall from end to end of the workspace: it does not run into it, and does not say that it arrived."""
+    scene = drawn["twins"][0]
+    wall = Obstacle(np.array([0.32, 0.0, 0.4]), np.array([0.02, 4.0, 2.0]))
+    goal = look_at([-0.2, 0.0, 0.45], [0.0, 0.0, 0.0])
+    truths = solved(replace(scene, obstacles=(wall,), goal_world_from_camera=goal,
+                            objects=(scene.target_placed,)))
+    assert not truths[-1].success
+    assert not truths[-1].declared
+    assert np.ptp([t.world_from_camera[:3, 3] for t in truths[1:]], axis=0).max() < 1e-9
 
 
 @pytest.mark.parametrize("kind", TABLES)

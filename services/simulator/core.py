@@ -62,7 +62,8 @@ class Simulator:
 
     Every step gives a Truth and, until the episode is over, a Frame. With `goal_rgb` [H, W, 3] the user's image
     replaces the goal image of the scene. Its viewpoint is unknown, so no step is a success, and the episode ends when
-    the agent says that it has arrived. `notes` tells the user what is assumed, one line for each assumption.
+    the agent says that it has arrived. `notes` tells the user what is assumed, one line for each assumption. In scenes
+    with a workspace, `also` limits where the camera may be: it takes positions [N, 3] (metres) and returns [N] truths.
     """
 
     def __init__(self, world: World, scenes: Sequence[Scene], *, max_steps: int = MAX_STEPS,
@@ -72,7 +73,7 @@ class Simulator:
         self.world, self.scenes, self.max_steps = world, tuple(scenes), max_steps
         self.publish_depth, self.goal_rgb, self.explore = publish_depth, goal_rgb, explore
         self.until = "declared" if goal_rgb is not None else until
-        self.looks, self.notes, self._also = looks or Looks(Config()), notes, also
+        self.looks, self.notes, self.also = looks or Looks(Config()), notes, also
         self._sizes_m = {name: mesh.size_m for name, mesh in world.meshes.items()}
         self._furnished = False
         # Camera pose, image and depth of the last frame. Where the camera stands still, nothing is rendered again.
@@ -93,7 +94,7 @@ class Simulator:
         self.scene = self.scenes[episode]
         self._run, self._episode = run, episode
         self.look, goal_look = self.looks.of(episode)
-        self.stage, self._seen = Stage(self.scene, self._sizes_m, self._also), np.zeros(0)
+        self.stage, self._seen = Stage(self.scene, self._sizes_m, self.also), np.zeros(0)
         self._happened: list[str] = []
         target, spheres = self.scene.target_placed, self._spheres()
         self._symmetry = self.world.meshes[target.name].symmetry
