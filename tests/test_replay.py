@@ -93,7 +93,7 @@ def test_a_log_without_places_and_instances_tells_a_scene_of_the_paper():
     truths = [m for t, _, m in RunReader(FORMAT_5) if t == TRUTH]
     assert goal.workspace_m is None
     assert {(t.target_instance, t.instances, t.events) for t in truths} == {(1, None, None)}
-    assert truths[0].labels == truths[0].names
+    assert truths[0].labels() == truths[0].names
     assert not changes(FORMAT_5, GOLDEN)
 
 

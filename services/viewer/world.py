@@ -99,7 +99,8 @@ class World:
         if truth.rotations is not None:
             turned = [rr.Quaternion(xyzw=quaternion(rotation)) for rotation in truth.rotations]
         self._to.log(TRUTH, rr.Boxes3D(
-            centers=truth.centers_m, half_sizes=half, quaternions=turned, labels=[plain(name) for name in truth.labels],
+            centers=truth.centers_m, half_sizes=half, quaternions=turned,
+            labels=[plain(label) for label in truth.labels()],
             colors=[(*self._colour_of(name), 70) for name in truth.names], fill_mode="solid", show_labels=False))
 
     def _camera(self, path: str, world_from_camera: NDArray[np.float64], intrinsics_px: ArrayLike,

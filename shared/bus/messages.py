@@ -7,6 +7,7 @@ import dataclasses
 import functools
 import typing
 from dataclasses import dataclass
+from itertools import zip_longest
 from typing import Annotated, Any, ClassVar, TypeVar
 
 import numpy as np
@@ -285,18 +286,18 @@ class Truth(Message):
     events: list[str] | None = None
     """What happened to objects with this step, such as `moved soup_can#2`."""
 
-    @property
     def labels(self) -> list[str]:
         """The objects' names, with their numbers where there are several: `soup_can`, `soup_can#2`."""
-        numbers = [1] * len(self.names) if self.instances is None else self.instances.tolist()
-        return [label_of(name, number) for name, number in zip(self.names, numbers, strict=True)]
+        numbers = [] if self.instances is None else self.instances.tolist()
+        return [label_of(name, number) for name, number in zip_longest(
+            self.names, numbers[:len(self.names)], fillvalue=1)]
 
     def world_from_objects(self) -> np.ndarray:
         """Rotations world_from_object [N, 3, 3] of all objects, whichever way they are told."""
         if self.rotations is not None:
             return self.rotations
         cosines, sines = np.cos(self.yaws_rad), np.sin(self.yaws_rad)
-        turned = np.zeros((len(self.names), 3, 3))
+        turned = np.zeros((len(self.yaws_rad), 3, 3))
         turned[:, 0, 0] = turned[:, 1, 1] = cosines
         turned[:, 1, 0], turned[:, 0, 1], turned[:, 2, 2] = sines, -sines, 1.0
         return turned
