@@ -7,7 +7,6 @@ import dataclasses
 import functools
 import typing
 from dataclasses import dataclass
-from itertools import zip_longest
 from typing import Annotated, Any, ClassVar, TypeVar
 
 import numpy as np
@@ -289,8 +288,8 @@ class Truth(Message):
     def labels(self) -> list[str]:
         """The objects' names, with their numbers where there are several: `soup_can`, `soup_can#2`."""
         numbers = [] if self.instances is None else self.instances.tolist()
-        return [label_of(name, number) for name, number in zip_longest(
-            self.names, numbers[:len(self.names)], fillvalue=1)]
+        numbers += [1] * (len(self.names) - len(numbers))
+        return [label_of(name, number) for name, number in zip(self.names, numbers, strict=False)]
 
     def world_from_objects(self) -> np.ndarray:
         """Rotations world_from_object [N, 3, 3] of all objects, whichever way they are told."""
