@@ -36,6 +36,12 @@ _FORMS = {
 }
 
 
+def label_of(name: str, instance: int) -> str:
+    """What one of several objects of a kind is called: `soup_can` for the first one, `soup_can#2` for the second. No
+    object's own name has a `#`."""
+    return name if instance == 1 else f"{name}#{instance}"
+
+
 def plain(error: Mapping[str, Any]) -> str:
     """Returns what to do about an error of pydantic (an entry of its `errors()`)."""
     kind, context = error["type"], error.get("ctx", {})

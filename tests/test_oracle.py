@@ -8,7 +8,7 @@ import pytest
 from saccade.services.planner.motion import STEP_M, reach, step_towards, turn_towards, way_around
 from saccade.services.planner.oracle import Oracle
 from saccade.services.simulator.scenes import PAPER_SCENES, generate_split, load_scenes
-from saccade.shared.bus.messages import Truth
+from saccade.shared.bus.messages import Goal, Truth
 from saccade.shared.bus.wire import encode
 from saccade.shared.render.objects import YCB_NAMES, load_mesh, ycb_folder
 from saccade.shared.world.geometry import look_at, rotation_angle, rotation_xyz
@@ -192,7 +192,8 @@ def test_the_oracle_speaks_the_wire():
                   centers_m=episode.spheres.centers_m, yaws_rad=np.zeros(3), keep_out_m=episode.spheres.radii_m,
                   target_center_m=scene.target_placed.center_m, world_from_camera=episode.camera,
                   goal_world_from_camera=episode.goal, success=False, done=False)
-    output, = oracle.step({"truth": truth})
+    output, = oracle.step({"truth": truth, "goal": Goal(run="r", episode=0, step=0, rgb=None,
+                                                       intrinsics_px=np.ones(4))})
     assert encode(output.message)
     assert output.message.step == 4
     expected = step_towards(episode.camera, episode.goal, episode.spheres)

@@ -18,7 +18,7 @@ from saccade.app.replay.replay import REPLAYABLE
 from saccade.app.replay.tolerances import TOLERANCES, tolerance_of
 from saccade.app.run.run import run
 from saccade.shared.bus.messages import field_types
-from saccade.shared.bus.topics import ACTION, BELIEF, FRAME, GOAL_PERCEPT, PERCEPT, STATUS, TOPICS
+from saccade.shared.bus.topics import ACTION, BELIEF, FRAME, GOAL, GOAL_PERCEPT, PERCEPT, STATUS, TOPICS, TRUTH
 from saccade.shared.bus.wire import encode
 from saccade.shared.log.migrations import FORMAT, OLDEST
 from saccade.shared.log.reading import RunReader
@@ -26,8 +26,8 @@ from saccade.shared.log.recording import RunLog
 from saccade.tests.fixtures.make import CONFIG, GOLDEN, IN_WORDS, WORDS, changes, in_words
 from saccade.tests.samples import sample
 
-FORMAT_1, FORMAT_2, FORMAT_3, FORMAT_4 = OLDER = tuple(
-    GOLDEN.with_name(f"format_{number}.mcap") for number in (1, 2, 3, 4))
+FORMAT_1, FORMAT_2, FORMAT_3, FORMAT_4, FORMAT_5 = OLDER = tuple(
+    GOLDEN.with_name(f"format_{number}.mcap") for number in (1, 2, 3, 4, 5))
 WAIT_S = 300
 
 
@@ -85,6 +85,16 @@ def test_what_a_format_did_not_have_is_no_difference(tmp_path, log, lacks):
                    tmp_path / "replay")
     assert done.returncode == 0, done.stdout + done.stderr
     assert "0 beyond what is tolerated" in done.stdout
+
+
+def test_a_log_without_places_and_instances_tells_a_scene_of_the_paper():
+    """Format 5: goal and truth lacked them. All that was in it is as it was."""
+    goal, = (m for t, _, m in RunReader(FORMAT_5) if t == GOAL)
+    truths = [m for t, _, m in RunReader(FORMAT_5) if t == TRUTH]
+    assert goal.workspace_m is None
+    assert {(t.target_instance, t.instances, t.events) for t in truths} == {(1, None, None)}
+    assert truths[0].labels() == truths[0].names
+    assert not changes(FORMAT_5, GOLDEN)
 
 
 def test_on_the_bus_as_in_one_process_nothing_is_lost(tmp_path):

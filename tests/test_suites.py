@@ -8,8 +8,9 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from saccade.app.bench.suites import SUITES, default_suite, suite_file
+from saccade.app.bench.suites import default_suite, suite_file
 from saccade.services.simulator.scenes import PAPER_SCENES, load_scenes, overlapping
+from saccade.services.simulator.suites import SUITES
 from saccade.shared.config import Config
 from saccade.shared.errors import SaccadeError
 

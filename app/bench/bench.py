@@ -21,12 +21,13 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from saccade.app.bench import table
-from saccade.app.bench.suites import SUITES, default_suite, suite_file
+from saccade.app.bench.suites import default_suite, suite_file
 from saccade.app.bench.workers import in_processes
 from saccade.app.provenance import machine, shown
 from saccade.app.run.display import say
 from saccade.app.run.registry import Pair, local_pairs, weight_hashes
 from saccade.services.simulator.scenes import Scene, load_scenes
+from saccade.services.simulator.suites import SUITES
 from saccade.shared.bus.messages import Message, Result
 from saccade.shared.bus.topics import Topic
 from saccade.shared.config import Config, merged

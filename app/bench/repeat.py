@@ -10,10 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from saccade.app.bench.bench import MAX_FILE_BYTES, RECORD_KEYS, RUN, SCENES_ENDING, cores, record_of
-from saccade.app.bench.suites import SUITES, suite_file
+from saccade.app.bench.suites import suite_file
 from saccade.app.look.picture import Story
 from saccade.app.run.registry import weight_hashes
-from saccade.services.simulator.scenes import MAX_ID, Scene, load_scenes
+from saccade.services.simulator.fields import MAX_ID
+from saccade.services.simulator.scenes import Scene, load_scenes
+from saccade.services.simulator.suites import SUITES
 from saccade.shared.bus.messages import Message
 from saccade.shared.bus.topics import Topic
 from saccade.shared.config import PACKAGE, Config, validate

@@ -30,7 +30,8 @@ Cluster = Annotated[str | None, typer.Option(
 @app.command()
 def bench(*, objects: Objects = None, scenes: ScenesFile = None,
           suite: Annotated[str | None, typer.Option(
-              help="Scenes: paper-500, yaw-500, lexa-room, looks, dev (for tuning), paper-like or paper-like-yaw.",
+              help="Scenes: paper-500, yaw-500, lexa-room, looks, dev (for tuning), paper-like, paper-like-yaw, "
+                   "twins, lying, moving, drifting, crowd or anywhere.",
               show_default="paper-500 for ycb, paper-like for pantry")] = None,
           agent: Annotated[str | None, typer.Option(
               help=f"Which agent to measure: {AGENTS}.", show_default=AGENT_DEFAULT)] = None,

@@ -91,15 +91,18 @@ class Scene:
             if truth.episode != self._goal_posed:
                 self._goal_posed = truth.episode
                 yield from self._goal_view(at)
+        turned = [Rotation.from_euler("z", yaw).as_matrix() for yaw in truth.yaws_rad]
+        if truth.rotations is not None and all(_is_rotation(rotation) for rotation in truth.rotations):
+            turned = list(truth.rotations)
         yield "/truth/objects", cloud(truth.centers_m, TRUE, 1.0, at)
         yield "/truth/labels", update("objects", at, spheres=[
             fm.SpherePrimitive(pose=pose(np.eye(3), center), size=vector([MARK_M] * 3), color=colour(TRUE))
             for center in truth.centers_m], arrows=[
-            fm.ArrowPrimitive(pose=pose(Rotation.from_euler("z", yaw).as_matrix(), center), color=colour(TRUE, 0.5),
+            fm.ArrowPrimitive(pose=pose(rotation, center), color=colour(TRUE, 0.5),
                               shaft_length=YAW_M, shaft_diameter=0.005, head_length=0.02, head_diameter=0.012)
-            for center, yaw in zip(truth.centers_m, truth.yaws_rad, strict=False)], texts=[
+            for center, rotation in zip(truth.centers_m, turned, strict=False)], texts=[
             label(f"{name} (target)" if name == truth.target else name, center, TRUE)
-            for name, center in zip(truth.names, truth.centers_m, strict=False)])
+            for name, center in zip(truth.labels(), truth.centers_m, strict=False)])
         yield from self._way(truth, at)
 
     def _way(self, message: Frame | Truth, at: fm.Timestamp) -> Iterator[Told]:
@@ -172,9 +175,13 @@ def camera_pose(topic: str, world_from_camera: NDArray[np.float64], frame: str, 
     not a pose."""
     world_from_optical = world_from_camera @ CAMERA_FROM_OPTICAL
     rotation = world_from_optical[:3, :3]
-    if np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) and np.linalg.det(rotation) > 0:
+    if _is_rotation(rotation):
         yield topic, fm.FrameTransform(timestamp=at, parent_frame_id=WORLD, child_frame_id=frame,
                                        translation=vector(world_from_optical[:3, 3]), rotation=quaternion(rotation))
+
+
+def _is_rotation(matrix: NDArray[np.float64]) -> bool:
+    return bool(np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-3) and np.linalg.det(matrix) > 0)
 
 
 def cloud(points_m: NDArray[Any], rgb: tuple[float, float, float], alpha: float, at: fm.Timestamp) -> fm.PointCloud:

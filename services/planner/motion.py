@@ -41,7 +41,7 @@ def step_towards(world_from_camera: ArrayLike, goal_world_from_camera: ArrayLike
     way = way_around(here, there, spheres)
     gap = np.linalg.norm(way[-1] - there)  # 0 unless the goal is inside a sphere or outside the workspace
     inwards = gap > _SLACK_M and np.linalg.norm(here - there) <= gap + _SLACK_M
-    position = reach(there, spheres, here) if inwards else _along(way, step_m)
+    position = reach(there, spheres, here) if inwards else along(way, step_m)
     return position - here, turn_towards(camera[:3, :3], goal[:3, :3])
 
 
@@ -148,7 +148,7 @@ def _free(starts: Array, ends: Array, spheres: Spheres) -> np.ndarray:
     return free
 
 
-def _along(way: Array, distance_m: float) -> Array:
+def along(way: Array, distance_m: float) -> Array:
     """The point [3] at this distance along a path [K, 3], or the end of the path if it is shorter."""
     for here, there in pairwise(way):
         length = float(np.linalg.norm(there - here))

@@ -15,13 +15,15 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from saccade.services.simulator.core import Simulator
-from saccade.services.simulator.scenes import Scene, generate_scene, load_scenes
+from saccade.services.simulator.core import Simulator, world_for
+from saccade.services.simulator.scene import Obstacle, Placed, Scene
+from saccade.services.simulator.scenes import generate_scene, load_scenes
+from saccade.services.simulator.suites import suite_of
+from saccade.services.simulator.tables import MOST_DRAWN, MOST_OBSTACLES, TABLES, draw_table
 from saccade.shared.bus.messages import Action, Frame
 from saccade.shared.config import SceneConfig
 from saccade.shared.errors import SaccadeError
 from saccade.shared.render.objects import load_mesh, names_in_use
-from saccade.shared.render.world import World
 from saccade.shared.world.geometry import IMAGE_SIZE_PX, INTRINSICS_PX
 from saccade.shared.world.task import ACTION_LIMIT, MAX_STEPS, errors
 
@@ -39,16 +41,17 @@ class ActiveSearch(gymnasium.Env[Observation, NDArray[np.float64]]):
     `info` holds the id of the scene and the errors in azimuth, elevation and range.
 
     Every reset draws a scene with the environment's random generator. With a file `scenes` it draws one of the file's
-    scenes, or takes the one that reset's options name (`scene=<id>`). Without a file it draws a new scene with
-    `n_objects` objects, or with a random number of objects. Raises SaccadeError if an object or the file is missing or
-    damaged.
+    scenes, or takes the one that reset's options name (`scene=<id>`). With a `suite` of the benchmark it draws scenes
+    of that kind: new ones of `twins`, `lying`, `moving`, `drifting`, `crowd` and `anywhere`, and the suite's own of
+    the others. Without both it draws a new scene with `n_objects` objects, or with a random number of objects. Raises
+    SaccadeError if an object or the file is missing or damaged, or if the suite is unknown or of other objects.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 - Gymnasium's interface
 
     def __init__(self, *, objects: str = "pantry", names: Sequence[str] | None = None,
                  n_objects: int | None = None, yaw: Literal["random", "fixed"] = "random",
-                 scenes: str | Path | None = None,
+                 scenes: str | Path | None = None, suite: str | None = None,
                  max_steps: int = MAX_STEPS, size_px: int = IMAGE_SIZE_PX, render_mode: str | None = None):
         image = spaces.Box(0, 255, (size_px, size_px, 3), np.uint8)
         self.observation_space = spaces.Dict(
@@ -56,9 +59,17 @@ class ActiveSearch(gymnasium.Env[Observation, NDArray[np.float64]]):
         self.action_space = spaces.Box(-ACTION_LIMIT, ACTION_LIMIT, (6,), np.float64)
         self.render_mode, self.yaw, self.n_objects, self.max_steps = render_mode, yaw, n_objects, max_steps
         in_use = names_in_use(SceneConfig(objects=objects, names=tuple(names) if names is not None else None))
-        self._world = World(tuple(load_mesh(objects, name) for name in in_use), size_px=size_px,
-                            intrinsics_px=np.array(INTRINSICS_PX) * size_px / IMAGE_SIZE_PX)
-        self._file = {scene.id: scene for scene in load_scenes(Path(scenes), in_use)} if scenes is not None else {}
+        if scenes is not None and suite is not None:
+            raise SaccadeError("scenes come from a file or from a suite: leave `scenes` or `suite` out")
+        meshes = tuple(load_mesh(objects, name) for name in in_use)
+        self._kind = suite if suite in TABLES else None
+        known = load_scenes(Path(scenes), in_use) if scenes is not None else []
+        if suite is not None and self._kind is None:
+            known = suite_of(suite, objects).scenes({mesh.name: mesh for mesh in meshes}, 0)
+        self._file = {scene.id: scene for scene in known}
+        scale = size_px / IMAGE_SIZE_PX
+        self._world = world_for(meshes, known or (_largest(in_use) if self._kind else []), size_px=size_px,
+                                intrinsics_px=np.array(INTRINSICS_PX) * scale)
         self._simulator: Simulator | None = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict]:
@@ -79,6 +90,9 @@ class ActiveSearch(gymnasium.Env[Observation, NDArray[np.float64]]):
             return self._file[scene_id or str(self.np_random.choice(list(self._file)))]
         sizes = {name: mesh.size_m for name, mesh in self._world.meshes.items()}
         target = str(self.np_random.choice(list(sizes)))
+        if self._kind is not None:
+            return draw_table(self._kind, self.np_random, self._world.meshes, target,
+                              int(self.np_random.integers(1000)), "drawn")
         count = self.n_objects or int(self.np_random.integers(1, len(sizes) + 1))
         return generate_scene(self.np_random, sizes, target, count, yaw=self.yaw)
 
@@ -112,10 +126,17 @@ class ActiveSearch(gymnasium.Env[Observation, NDArray[np.float64]]):
         self._world.close()
 
 
+def _largest(names: Sequence[str]) -> list[Scene]:
+    """A scene with as many of each kind, and as many obstacles, as any that is drawn may have."""
+    objects = tuple(Placed(name, np.zeros(3), 0.0, k + 1) for name in names for k in range(MOST_DRAWN))
+    obstacles = (Obstacle(np.zeros(3), np.ones(3)),) * MOST_OBSTACLES
+    return [Scene("largest", names[0], (0, 0, 0), objects, np.eye(4), obstacles=obstacles)]
+
+
 def _info(simulator: Simulator) -> dict[str, Any]:
-    state, scene = simulator.state, simulator.scene
-    azimuth, elevation, distance = errors(state.camera[:3, 3], state.goal[:3, 3], scene.target_placed.center_m)
-    return {"scene": scene.id, "azimuth_error_rad": azimuth, "elevation_error_rad": elevation,
+    state = simulator.state
+    azimuth, elevation, distance = errors(state.camera[:3, 3], state.goal[:3, 3], state.target[0])
+    return {"scene": simulator.scene.id, "azimuth_error_rad": azimuth, "elevation_error_rad": elevation,
             "range_error_m": distance}
 
 

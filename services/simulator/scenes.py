@@ -1,73 +1,38 @@
 """Scenes: which objects stand where, and which view is the goal.
 
 A scene is read from a file, or drawn by the paper's rules (section 4.1). A file is JSON, `{"scenes": [...]}`, with one
-map per scene. Its keys are those of SCENE_KEYS. Units are metres and radians, and the table top is at z = 0.
+map per scene. Its keys are those in scene_entry.py. Units are metres and radians, and the table top is at z = 0 unless
+the scene says otherwise.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence, Set
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from saccade.shared.errors import SaccadeError, is_text, told
+from saccade.services.simulator.scene import Placed, Scene
+from saccade.services.simulator.scene_entry import entry_of, scene_from
+from saccade.shared.errors import SaccadeError, told
 from saccade.shared.files import MIB, parse_json, read_text, replace_whole, writing
 from saccade.shared.world.geometry import direction, look_at
 from saccade.shared.world.task import GOAL_CLEARANCE_M, clip, spheres_around
 
 PAPER_SCENES = Path(__file__).parent / "scenes" / "paper_500.json"
-SCENE_KEYS = {"id", "target", "table_rgb", "objects", "goal_world_from_camera"}
-OBJECT_KEYS = {"name", "center_xyz_m", "yaw_rad"}
 HALF_SPREAD_M = 0.25  # objects stand in the square [-0.25, 0.25]^2
 GOAL_RANGE_MAX_M = 0.50
 MAX_FILE_BYTES, MAX_SCENES = 64 * MIB, 20_000
-MAX_ID = 256  # characters of an id or a name: it is in messages and in file names
-MAX_NUMBERS = {"center_xyz_m": 10.0, "goal_world_from_camera": 10.0, "yaw_rad": 1e4}  # what is further is not seen
 ROOM_SEED, ROOM_GOALS = 27_182_000, 20  # of the suite lexa-room: its seed, and the number of goals of each target
 _NEED = "give a scenes file"
 _TRIES = 100  # attempts to place an object before all objects are placed anew, and how often this is done
 
 Sizes = Mapping[str, ArrayLike]  # name -> extents [3] of the object's box, metres
-
-
-@dataclass(frozen=True)
-class Placed:
-    """An object on the table: the centre of its box [3] (metres, world) and its yaw (radians)."""
-
-    name: str
-    center_m: NDArray[np.float64]
-    yaw_rad: float
-
-
-@dataclass(frozen=True)
-class Scene:
-    """The world of one episode. `table_rgb` is from 0 to 255; `goal_world_from_camera` [4, 4] is the goal view's pose.
-
-    With `target_absent` the target does not stand on the table. Its position is then used for the goal image only.
-    """
-
-    id: str
-    target: str
-    table_rgb: tuple[int, int, int]
-    objects: tuple[Placed, ...]
-    goal_world_from_camera: NDArray[np.float64]
-    target_absent: bool = False
-
-    @property
-    def target_placed(self) -> Placed:
-        """The target and its position."""
-        return next(placed for placed in self.objects if placed.name == self.target)
-
-    @property
-    def on_table(self) -> tuple[Placed, ...]:
-        """The objects that stand on the table."""
-        return tuple(p for p in self.objects if not (self.target_absent and p.name == self.target))
 
 
 def load_scenes(path: Path, names: Sequence[str] | None = None) -> list[Scene]:
@@ -89,7 +54,7 @@ def load_scenes(path: Path, names: Sequence[str] | None = None) -> list[Scene]:
     for index, entry in enumerate(entries):
         name = entry.get("id", index) if isinstance(entry, dict) else index
         try:
-            scene = _scene(entry, names)
+            scene = scene_from(entry, names)
             if scene.id in scenes:
                 raise ValueError("its id occurs twice: make ids unique")
         except (ValueError, TypeError, KeyError, OverflowError) as error:
@@ -98,93 +63,9 @@ def load_scenes(path: Path, names: Sequence[str] | None = None) -> list[Scene]:
     return list(scenes.values())
 
 
-def _scene(entry: Any, names: Sequence[str] | None) -> Scene:
-    _check_keys(entry, SCENE_KEYS, {"target_absent"})
-    _check_text(entry, "id")
-    if not isinstance(entry["objects"], list) or not entry["objects"]:
-        raise ValueError("objects must be a list of at least one object")
-    objects = tuple(_placed(placed, names) for placed in entry["objects"])
-    present = [placed.name for placed in objects]
-    if len(set(present)) < len(present):
-        raise ValueError("an object stands in it twice: name each at most once")
-    if entry["target"] not in present:
-        raise ValueError(f"target {told(entry['target'])} is not among its objects: add it, with "
-                         "\"target_absent\": true if it must not stand on the table")
-    absent = entry.get("target_absent", False)
-    if not isinstance(absent, bool):
-        raise ValueError("target_absent must be true or false")
-    rgb = _numbers(entry, "table_rgb", (3,))
-    if not ((rgb >= 0) & (rgb <= 255) & (rgb == rgb.round())).all():
-        raise ValueError("table_rgb must be three whole numbers from 0 to 255")
-    goal = _numbers(entry, "goal_world_from_camera", (4, 4))
-    rotation = goal[:3, :3]
-    if (np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-4 or np.linalg.det(rotation) < 0
-            or np.abs(goal[3] - (0, 0, 0, 1)).max() > 1e-6):
-        raise ValueError("goal_world_from_camera is not a rigid transform")
-    red, green, blue = (int(value) for value in rgb)
-    return Scene(entry["id"], entry["target"], (red, green, blue), objects, goal, absent)
-
-
-def _placed(entry: Any, names: Sequence[str] | None) -> Placed:
-    _check_keys(entry, OBJECT_KEYS)
-    name = entry["name"]
-    _check_text(entry, "name")
-    if names is not None and name not in names:
-        raise ValueError(f"object {told(name)} is not in use: choose the set that has it (have {', '.join(names)})")
-    return Placed(name, _numbers(entry, "center_xyz_m", (3,)), float(_numbers(entry, "yaw_rad", ())))
-
-
-def _check_text(entry: dict[str, Any], key: str) -> None:
-    text = entry[key]
-    if not isinstance(text, str) or not text:
-        raise ValueError(f"{key} must be a text")
-    if len(text) > MAX_ID:
-        raise ValueError(f"{key} has {len(text)} characters: shorten it to {MAX_ID}")
-    if not is_text(text):
-        raise ValueError(f"{key} must be Unicode without control codes: remove what is none")
-
-
-def _check_keys(entry: Any, required: Set[str], optional: Set[str] = frozenset()) -> None:
-    if not isinstance(entry, dict):
-        raise ValueError("not a map")
-    if missing := sorted(required - entry.keys()):
-        raise ValueError(f"{missing[0]} is missing")
-    if unknown := sorted(entry.keys() - required - optional):
-        raise ValueError(f"{told(unknown[0])[1:-1]} is unknown: remove it")
-
-
-def _numbers(entry: dict[str, Any], key: str, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    if not _has_shape(entry[key], shape):
-        raise ValueError(f"{key} must be numbers of shape {list(shape)}")
-    try:
-        raw = np.array(entry[key], dtype=np.float64)
-    except OverflowError as error:
-        raise ValueError(f"{key} is larger than any number here") from error
-    if not np.isfinite(raw).all():
-        raise ValueError(f"{key} is not finite")
-    if np.abs(raw).max() > (most := MAX_NUMBERS.get(key, np.inf)):
-        raise ValueError(f"{key} must be within ±{most:g}")
-    return raw
-
-
-def _has_shape(value: Any, shape: tuple[int, ...]) -> bool:
-    """Whether it is lists of that shape with nothing but numbers in them, before an array is made of it."""
-    if not shape:
-        return isinstance(value, int | float) and not isinstance(value, bool)
-    return isinstance(value, list) and len(value) == shape[0] and all(_has_shape(one, shape[1:]) for one in value)
-
-
 def save_scenes(path: Path, scenes: Sequence[Scene]) -> None:
     """Writes scenes to a file that `load_scenes` can read."""
-    entries = []
-    for scene in scenes:
-        entry: dict[str, Any] = {
-            "id": scene.id, "target": scene.target, "table_rgb": list(scene.table_rgb),
-            "objects": [{"name": p.name, "center_xyz_m": p.center_m.tolist(), "yaw_rad": p.yaw_rad}
-                        for p in scene.objects],
-            "goal_world_from_camera": scene.goal_world_from_camera.tolist()}
-        entries.append(entry | ({"target_absent": True} if scene.target_absent else {}))
-    text = '{"scenes": [\n' + ",\n".join(json.dumps(entry) for entry in entries) + "\n]}\n"
+    text = '{"scenes": [\n' + ",\n".join(json.dumps(entry_of(scene)) for scene in scenes) + "\n]}\n"
     with writing(path, "scenes"):
         replace_whole(path, text.encode())
 
@@ -204,7 +85,7 @@ def generate_scene(rng: np.random.Generator, sizes: Sizes, target: str, n_object
     names = [target, *(others[i] for i in rng.permutation(len(others))[:n_objects - 1])]
     names = [names[i] for i in rng.permutation(n_objects)]
     extents = np.array([sizes[name] for name in names], dtype=np.float64)
-    centers = np.c_[_spread(rng, np.linalg.norm(extents[:, :2], axis=1) / 2), extents[:, 2] / 2]
+    centers = np.c_[spread(rng, np.linalg.norm(extents[:, :2], axis=1) / 2), extents[:, 2] / 2]
     yaws = rng.uniform(-np.pi, np.pi, n_objects) if yaw == "random" else np.zeros(n_objects)
     index = names.index(target)
     goal = draw_goal(rng, centers, extents, index)
@@ -227,8 +108,10 @@ def draw_goal(rng: np.random.Generator, centers_m: ArrayLike, sizes_m: ArrayLike
     return goal
 
 
-def _spread(rng: np.random.Generator, radii_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Draws points xy [N, 2] (metres) whose circles do not overlap. It starts again if an object finds no room.
+def spread(rng: np.random.Generator, radii_m: NDArray[np.float64], half_m: float = HALF_SPREAD_M
+           ) -> NDArray[np.float64]:
+    """Draws points xy [N, 2] (metres) in a square of half the side `half_m` whose circles do not overlap. It starts
+    again if an object finds no room.
 
     Raises SaccadeError if this fails too often.
     """
@@ -236,7 +119,7 @@ def _spread(rng: np.random.Generator, radii_m: NDArray[np.float64]) -> NDArray[n
         points: list[NDArray[np.float64]] = []
         for radius in radii_m:
             for _ in range(_TRIES):
-                point = rng.uniform(-HALF_SPREAD_M, HALF_SPREAD_M, 2)
+                point = rng.uniform(-half_m, half_m, 2)
                 if all(np.linalg.norm(point - p) >= radius + r for p, r in zip(points, radii_m, strict=False)):
                     points.append(point)
                     break

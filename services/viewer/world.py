@@ -96,8 +96,11 @@ class World:
         for k, name in enumerate(truth.names):
             half[k] = self._sizes_m.get(name, 2 * half[k]) / 2
         turned = [rr.Quaternion(xyzw=(0, 0, np.sin(yaw / 2), np.cos(yaw / 2))) for yaw in truth.yaws_rad]
+        if truth.rotations is not None:
+            turned = [rr.Quaternion(xyzw=quaternion(rotation)) for rotation in truth.rotations]
         self._to.log(TRUTH, rr.Boxes3D(
-            centers=truth.centers_m, half_sizes=half, quaternions=turned, labels=[plain(name) for name in truth.names],
+            centers=truth.centers_m, half_sizes=half, quaternions=turned,
+            labels=[plain(label) for label in truth.labels()],
             colors=[(*self._colour_of(name), 70) for name in truth.names], fill_mode="solid", show_labels=False))
 
     def _camera(self, path: str, world_from_camera: NDArray[np.float64], intrinsics_px: ArrayLike,

@@ -11,6 +11,8 @@ from typing import Annotated, Any, ClassVar, TypeVar
 
 import numpy as np
 
+from saccade.shared.wording import label_of
+
 
 @dataclass(frozen=True)
 class ArraySpec:
@@ -66,12 +68,29 @@ class Frame(Message):
 
 @dataclass(frozen=True, kw_only=True)
 class Goal(Message):
-    """The image to reach. Without an image the agent explores."""
+    """The image to reach. Without an image the agent explores.
+
+    The fields about the place are there if the camera has a workspace of its own. Without them the rules of the paper
+    hold: the camera stays in a box and outside of spheres around the objects, and the table top is at z = 0."""
+
+    VERSION: ClassVar[int] = 2
 
     rgb: Annotated[np.ndarray, array("u1", "H", "W", 3)] | None
     """The image."""
     intrinsics_px: Annotated[np.ndarray, array("f8", 4)]
     """fx, fy, cx, cy in pixels."""
+    workspace_m: Annotated[np.ndarray, array("f8", 2, 3)] | None = None
+    """Lowest and highest corner of the box in which the camera stays."""
+    shell_m: Annotated[np.ndarray, array("f8", 5)] | None = None
+    """Centre (x, y, z), inner and outer radius of the shell in which the camera stays, as an arm reaches it."""
+    table_m: Annotated[np.ndarray, array("f8", 3)] | None = None
+    """Extents of the table along x and y, and the height z of its top."""
+    obstacle_centers_m: Annotated[np.ndarray, array("f8", "B", 3)] | None = None
+    """Centres of the boxes that are in the way."""
+    obstacle_sizes_m: Annotated[np.ndarray, array("f8", "B", 3)] | None = None
+    """Their sizes."""
+    obstacle_yaws_rad: Annotated[np.ndarray, array("f8", "B")] | None = None
+    """How they are turned about the vertical axis."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -219,7 +238,11 @@ class Action(Message):
 
 @dataclass(frozen=True, kw_only=True)
 class Truth(Message):
-    """The simulator's ground truth, for evaluator, viewer and oracle only. `step` counts the actions."""
+    """The simulator's ground truth, for evaluator, viewer and oracle only. `step` counts the actions.
+
+    Fields that are absent have the value of a scene as the paper's: each object stands upright and is there once."""
+
+    VERSION: ClassVar[int] = 2
 
     scene: str
     """Id of the scene."""
@@ -230,16 +253,17 @@ class Truth(Message):
     centers_m: Annotated[np.ndarray, array("f8", "N", 3)]
     """Centres of their boxes."""
     yaws_rad: Annotated[np.ndarray, array("f8", "N")]
-    """How they are turned about the vertical axis."""
+    """How they are turned about the vertical axis. 0 where `rotations` tell it."""
     keep_out_m: Annotated[np.ndarray, array("f8", "N")]
     """Radii of the spheres around them that the camera is pushed out of."""
     target_center_m: Annotated[np.ndarray, array("f8", 3)]
-    """Centre of the target, or of its place in the goal image where it does not stand on the table."""
+    """Centre of the target, or of its place in the goal image where it does not stand on the table. Of several of its
+    kind it is the one that the nearest goal pose shows."""
     world_from_camera: Annotated[np.ndarray, array("f8", 4, 4)]
     """Pose of the camera."""
     goal_world_from_camera: Annotated[np.ndarray, array("f8", 4, 4)]
-    """Pose of the camera that took the goal image. If the target is symmetric, it is turned with it so that it is the
-    nearest one to the camera of all that show the same."""
+    """Pose of the camera that took the goal image. It moves with the target. If the target is symmetric, or there are
+    several of its kind, it is the nearest one to the camera of all poses that show the same."""
     success: bool
     """The camera is, or was, within the tolerance of the goal's pose."""
     done: bool
@@ -248,6 +272,34 @@ class Truth(Message):
     """The agent has said that it had arrived."""
     declared_true: bool = False
     """It was within the tolerance when it first said so."""
+    instances: Annotated[np.ndarray, array("u1", "N")] | None = None
+    """Their numbers among the objects of the same name, from 1."""
+    target_instance: int = 1
+    """Number of the target at `target_center_m`."""
+    rotations: Annotated[np.ndarray, array("f8", "N", 3, 3)] | None = None
+    """Their rotations world_from_object. The object's frame is that of its mesh, with its origin at the centre."""
+    sizes_m: Annotated[np.ndarray, array("f8", "N", 3)] | None = None
+    """Sizes of their boxes, in their own frames. The camera stays away from these boxes in a workspace."""
+    in_view: Annotated[np.ndarray, array("f8", "N")] | None = None
+    """Share of each, from 0 to 1, that the camera sees: not hidden by others and within the image."""
+    events: list[str] | None = None
+    """What happened to objects with this step, such as `moved soup_can#2`."""
+
+    def labels(self) -> list[str]:
+        """The objects' names, with their numbers where there are several: `soup_can`, `soup_can#2`."""
+        numbers = [] if self.instances is None else self.instances.tolist()
+        numbers += [1] * (len(self.names) - len(numbers))
+        return [label_of(name, number) for name, number in zip(self.names, numbers, strict=False)]
+
+    def world_from_objects(self) -> np.ndarray:
+        """Rotations world_from_object [N, 3, 3] of all objects, whichever way they are told."""
+        if self.rotations is not None:
+            return self.rotations
+        cosines, sines = np.cos(self.yaws_rad), np.sin(self.yaws_rad)
+        turned = np.zeros((len(self.yaws_rad), 3, 3))
+        turned[:, 0, 0] = turned[:, 1, 1] = cosines
+        turned[:, 1, 0], turned[:, 0, 1], turned[:, 2, 2] = sines, -sines, 1.0
+        return turned
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -65,8 +65,21 @@ def with_several_rotations() -> Change:
     return change
 
 
+def with_places_and_instances() -> Change:
+    """Format 5 to 6: a goal may tell the workspace, and the truth may hold several of a kind, in any pose."""
+    added: dict[type[m.Message], Fields] = {
+        m.Goal: dict.fromkeys(("workspace_m", "shell_m", "table_m", "obstacle_centers_m", "obstacle_sizes_m",
+                               "obstacle_yaws_rad")),
+        m.Truth: dict.fromkeys(("instances", "rotations", "sizes_m", "in_view", "events")) | {"target_instance": 1}}
+
+    def change(topic: Topic, part: str | None, fields: Fields) -> Fields:
+        return fields | {"version": 2} | added[topic.type] if topic.type in added else fields
+
+    return change
+
+
 CHANGES: tuple[Callable[[], Change], ...] = (count_in_episodes, with_masks_and_candidates, with_poses,
-                                             with_several_rotations)
+                                             with_several_rotations, with_places_and_instances)
 FORMAT = OLDEST + len(CHANGES)
 
 

@@ -1,9 +1,10 @@
-"""The table, the objects and the camera in MuJoCo, which renders images. No physics runs: nothing moves by itself."""
+"""The table, the objects and the camera in MuJoCo, which renders images. No physics runs here: nothing moves by itself
+(services/simulator/physics.py lets objects fall)."""
 
 from __future__ import annotations
 
 import weakref
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,16 +23,20 @@ try:
 except (ImportError, AttributeError, OSError) as error:  # PyOpenGL raises AttributeError if the library is missing
     raise SaccadeError(f"{HOW_TO_MEND} ({error})") from error
 
-TABLE_SIDE_M = 1.0
-TABLE, PLAIN, SKY = "table", "plain", "sky"  # names in the model
+TABLE_SIDE_M, TABLE_HALF_M = 1.0, 0.01  # side, and half the thickness
+TABLE, PLAIN, SKY, OBSTACLE = "table", "plain", "sky", "obstacle"  # names in the model
 SKY_PX = 256  # side of each of the background's six faces
 LIGHT_M = 2.0  # how far from the centre of the table a light is put; it shines as from far away
 NEAR_M, FAR_M = 0.05, 3.0
+Furniture = tuple[ArrayLike, ArrayLike, float, ArrayLike]  # centre, size, yaw and colour of an obstacle
 _OUT_OF_SIGHT = np.array([0.0, 0.0, -100.0])
 
 
-def _build(meshes: tuple[Mesh, ...]) -> mujoco.MjModel:
-    """Compiles the model. Every body is a mocap body, so that a new scene needs no compilation."""
+def _build(meshes: tuple[Mesh, ...], further: Mapping[str, str], boxes: int) -> mujoco.MjModel:
+    """Compiles the model. Every body is a mocap body, so that a new scene needs no compilation.
+
+    `further` are more objects: their labels, and the names of their meshes. `boxes` is the number of obstacles.
+    """
     spec = mujoco.MjSpec()
     spec.stat.extent, spec.stat.center = 1.0, [0, 0, 0]
     spec.visual.map.znear, spec.visual.map.zfar = NEAR_M, FAR_M
@@ -39,13 +44,19 @@ def _build(meshes: tuple[Mesh, ...]) -> mujoco.MjModel:
     spec.visual.headlight.specular = [0, 0, 0]
     spec.visual.global_.offwidth = spec.visual.global_.offheight = IMAGE_SIZE_PX
     half = TABLE_SIDE_M / 2
-    spec.worldbody.add_geom(name="table", type=mujoco.mjtGeom.mjGEOM_BOX, size=[half, half, 0.01], pos=[0, 0, -0.01],
-                            contype=0, conaffinity=0)
+    spec.worldbody.add_geom(name="table", type=mujoco.mjtGeom.mjGEOM_BOX, size=[half, half, TABLE_HALF_M],
+                            pos=[0, 0, -TABLE_HALF_M], contype=0, conaffinity=0)
     rig = spec.worldbody.add_body(name="camera", mocap=True)
     rig.add_camera(name="camera", resolution=[IMAGE_SIZE_PX] * 2, sensor_size=[1, 1], focal_pixel=[IMAGE_SIZE_PX] * 2)
     _add_surroundings(spec)
     for mesh in meshes:
         _add_object(spec, mesh)
+    for label, name in further.items():
+        _add_body(spec, label, name)
+    for number in range(boxes):
+        body = spec.worldbody.add_body(name=f"{OBSTACLE} {number}", mocap=True)
+        body.add_geom(name=f"{OBSTACLE} {number}", type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.01, 0.01, 0.01],
+                      contype=0, conaffinity=0)
     model = spec.compile()
     for mesh in meshes:  # faster than in the specification, which takes texels as single Python numbers
         start = model.tex_adr[model.tex(mesh.name).id]
@@ -74,27 +85,33 @@ def _add_object(spec: mujoco.MjSpec, mesh: Mesh) -> None:
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = mesh.name
     spec.add_mesh(name=mesh.name, uservert=mesh.vertices_m.ravel().tolist(), userface=mesh.faces.ravel().tolist(),
                   usertexcoord=mesh.texcoords.ravel().tolist(), inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
-    body = spec.worldbody.add_body(name=mesh.name, mocap=True)
-    body.add_geom(name=mesh.name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name, material=mesh.name,
-                  contype=0, conaffinity=0)
+    _add_body(spec, mesh.name, mesh.name)
+
+
+def _add_body(spec: mujoco.MjSpec, label: str, name: str) -> None:
+    body = spec.worldbody.add_body(name=label, mocap=True)
+    body.add_geom(name=label, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, material=name, contype=0, conaffinity=0)
 
 
 class World:
     """A scene that can be rendered.
+
+    Each mesh is there once, under its name. `further` holds more objects, each with a label of its own and the name of
+    its mesh. `boxes` says how many obstacles `furnish` can show.
 
     It must not be shared between threads, because the OpenGL context belongs to the thread that creates it. Raises
     SaccadeError if OpenGL does not work.
     """
 
     def __init__(self, meshes: tuple[Mesh, ...], *, size_px: int = IMAGE_SIZE_PX,
-                 intrinsics_px: ArrayLike = INTRINSICS_PX):
+                 intrinsics_px: ArrayLike = INTRINSICS_PX, further: Mapping[str, str] | None = None, boxes: int = 0):
         self.meshes = {mesh.name: mesh for mesh in meshes}
-        self.size_px = size_px
-        self.model = _build(meshes)
+        self.size_px, self.boxes = size_px, boxes
+        self.model = _build(meshes, further or {}, boxes)
         self.model.vis.global_.offwidth = self.model.vis.global_.offheight = max(IMAGE_SIZE_PX, size_px)
         self.data = mujoco.MjData(self.model)
         self._rig = self.model.body("camera").mocapid[0]
-        self._mocap = {mesh.name: self.model.body(mesh.name).mocapid[0] for mesh in meshes}
+        self._mocap = {label: self.model.body(label).mocapid[0] for label in (*self.meshes, *(further or {}))}
         try:
             self.renderer = mujoco.Renderer(self.model, height=size_px, width=size_px)
         except Exception as error:  # each OpenGL platform raises its own class
@@ -112,11 +129,28 @@ class World:
         self.model.cam_intrinsic[0] = (fx, fy, 0.5 - cx, 0.5 - cy)
         self.intrinsics_px = np.asarray(intrinsics_px, dtype=np.float64)
 
+    def furnish(self, table_m: ArrayLike = (TABLE_SIDE_M, TABLE_SIDE_M, 0.0), obstacles: Sequence[Furniture] = ()
+                ) -> None:
+        """Gives the table other extents along x and y and another height of its top (`table_m` [3], metres), and puts
+        obstacles around it: for each its centre [3], size [3], yaw (radians) and colour from 0 to 255."""
+        x, y, top = np.asarray(table_m, dtype=np.float64)
+        self.model.geom("table").size[:] = (x / 2, y / 2, TABLE_HALF_M)
+        self.model.geom("table").pos[:] = (0.0, 0.0, top - TABLE_HALF_M)
+        for number in range(self.boxes):
+            geom, mocap = self.model.geom(f"{OBSTACLE} {number}"), self.model.body(f"{OBSTACLE} {number}").mocapid[0]
+            geom.rgba[3] = float(number < len(obstacles))
+            self.data.mocap_pos[mocap] = _OUT_OF_SIGHT
+            if number < len(obstacles):
+                center, size, yaw, rgb = obstacles[number]
+                geom.size[:], geom.rgba[:3] = np.asarray(size) / 2, np.asarray(rgb) / 255.0
+                self.data.mocap_pos[mocap] = center
+                self.data.mocap_quat[mocap] = (np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2))
+
     def place(self, poses: Mapping[str, tuple[ArrayLike, float | NDArray[np.float64]]],
               table_rgb: ArrayLike = (128, 128, 128)) -> None:
         """Puts objects at (box centre [3] in metres, yaw in radians or rotation [3, 3]).
 
-        Objects that are not named are out of sight. `table_rgb` is from 0 to 255.
+        Objects are named by their labels. Those that are not named are out of sight. `table_rgb` is from 0 to 255.
         """
         self.poses = dict(poses)
         textured = self.look.table_texture is not None

@@ -100,6 +100,19 @@ def quaternion(rotation: ArrayLike) -> Array:
     return np.linalg.eigh(k)[1][:, -1]
 
 
+def rotation_of(quaternion_xyzw: ArrayLike) -> Array:
+    """The rotation [3, 3] of a quaternion (x, y, z, w), which need not have length 1."""
+    x, y, z, w = np.asarray(quaternion_xyzw, dtype=np.float64) / np.linalg.norm(quaternion_xyzw)
+    return np.array([[1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+                     [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+                     [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)]])
+
+
+def yaw_rotation(angle: float) -> Array:
+    """The rotation [3, 3] by an angle (rad) about the vertical."""
+    return rotation_xyz((0.0, 0.0, angle))
+
+
 def rotation_vector(rotation: ArrayLike) -> Array:
     """The axis of a rotation [3, 3] times its angle in radians, which is at most pi: [3]."""
     turned = quaternion(rotation)

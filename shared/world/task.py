@@ -6,6 +6,7 @@ These are functions of poses without rendering. So simulator, evaluator, planner
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -15,6 +16,7 @@ from numpy.typing import ArrayLike
 from saccade.shared.errors import SaccadeError, told
 from saccade.shared.world.geometry import Array, direction, look_at, rotation_angle, rotation_xyz, spherical, wrap
 from saccade.shared.world.symmetry import NONE, turned_about, turns_of
+from saccade.shared.world.workspace import Space
 
 MAX_STEPS = 350
 ACTION_LIMIT = 0.5  # metres and radians, each component
@@ -133,6 +135,47 @@ def nearest_goal(world_from_camera: ArrayLike, goals: Array) -> Array:
     return goals[np.argmin(np.maximum(apart, rotation_angle(goals[:, :3, :3], camera[:3, :3]) / SUCCESS_ROTATION_RAD))]
 
 
+@dataclass(frozen=True)
+class GoalViews:
+    """The views that look like the goal image: camera poses [G, 4, 4], the centres [G, 3] (metres) of the targets that
+    they show, and the numbers of these among those of their kind."""
+
+    world_from_camera: Array
+    centers_m: Array
+    instances: tuple[int, ...]
+
+    def nearest(self, world_from_camera: ArrayLike) -> int:
+        """The number of the view to which a camera pose [4, 4] is nearest, as in `nearest_goal`."""
+        if len(self.instances) == 1:
+            return 0
+        near = nearest_goal(world_from_camera, self.world_from_camera)
+        return int(np.flatnonzero((self.world_from_camera == near).all((1, 2)))[0])
+
+
+def views_of_all(goal_world_from_camera: ArrayLike, world_from_target: ArrayLike, world_from_same: ArrayLike,
+                 instances: Sequence[int], symmetry: int, space: Space | None, spheres: Spheres) -> GoalViews:
+    """The views from which any target looks as from the goal pose [4, 4], where it had the pose [4, 4] when the goal
+    image was taken. The targets have the poses [I, 4, 4] now.
+
+    A view is moved with its target as if both were one piece. Those that the camera cannot come near to are left out,
+    unless none is left.
+    """
+    poses = np.asarray(world_from_same, dtype=np.float64)
+    seen_from = np.linalg.inv(np.asarray(world_from_target, dtype=np.float64)) @ np.asarray(goal_world_from_camera)
+    around = turned_about(np.zeros(3), seen_from, turns_of(symmetry))  # in the target's own frame
+    views = (poses[:, None] @ around).reshape(-1, 4, 4)
+    which = np.repeat(np.arange(len(poses)), len(around))
+    eyes = views[:, :3, 3]
+    if space is None:
+        gaps = np.linalg.norm(clip(eyes, spheres) - eyes, axis=1)
+    else:
+        gaps = np.maximum(np.linalg.norm(space.reach.nearest(eyes) - eyes, axis=1), -space.room_m(eyes))
+    near = gaps < SUCCESS_TRANSLATION_M
+    if not near.any():
+        near = np.arange(len(views)) == 0
+    return GoalViews(views[near], poses[which[near], :3, 3], tuple(instances[k] for k in which[near]))
+
+
 def errors(position: ArrayLike, goal_position: ArrayLike, target_center: ArrayLike) -> tuple[float, float, float]:
     """Returns (|azimuth| rad, |elevation| rad, |range| m) between two camera positions [3], as seen from the centre of
     the target [3]."""
@@ -148,25 +191,37 @@ class Episode:
     The episode ends when the camera is at the goal, as in the paper. With `until="declared"` it ends when the agent
     first says that it is there. Both also end after `max_steps`. With `judged=False` there is no goal to judge by, and
     no episode succeeds. If the target at `center_m` [3] is symmetric, any view that looks like the goal's is the goal.
+    With a `space` the camera runs through nothing (shared/world/workspace.py), otherwise the rule of the paper holds.
+    It begins at `start` [4, 4]. Where the world changes, `change` tells it.
     """
 
     def __init__(self, goal_world_from_camera: ArrayLike, spheres: Spheres, *, max_steps: int = MAX_STEPS,
                  judged: bool = True, until: Literal["reached", "declared"] = "reached",
-                 center_m: ArrayLike = (0.0, 0.0, 0.0), symmetry: int = NONE):
-        self._goals = equal_goals(goal_world_from_camera, center_m, symmetry, spheres)
-        self.spheres, self.max_steps, self.judged, self.until = spheres, max_steps, judged, until
+                 center_m: ArrayLike = (0.0, 0.0, 0.0), symmetry: int = NONE, start: ArrayLike | None = None,
+                 space: Space | None = None):
+        goals = equal_goals(goal_world_from_camera, center_m, symmetry, spheres)
+        self.views = GoalViews(goals, np.tile(np.asarray(center_m, dtype=np.float64), (len(goals), 1)),
+                               (1,) * len(goals))
+        self.spheres, self.space, self.max_steps, self.judged, self.until = spheres, space, max_steps, judged, until
+        self.there = True  # whether there is a target, and so a view to reach
         self.reached = False  # whether the camera has been at the goal, at any step
         self.step, self.declared, self.declared_true = 0, False, False
-        self.camera = self._allowed(start_pose())
+        self.camera = start_pose() if start is None else np.array(start, dtype=np.float64)
+        self.camera[:3, 3] = self._allowed(self.camera[:3, 3], self.camera[:3, 3])
 
-    def _allowed(self, camera: Array) -> Array:
-        camera[:3, 3] = clip(camera[:3, 3], self.spheres)
-        return camera
+    def _allowed(self, before: Array, after: Array) -> Array:
+        return clip(after, self.spheres) if self.space is None else self.space.moved(before, after)
+
+    def change(self, spheres: Spheres, space: Space | None, views: GoalViews | None) -> None:
+        """Takes what the world is like from now on. Without `views` there is no target, and so no success."""
+        self.spheres, self.space, self.there = spheres, space, views is not None
+        self.views = views or self.views
 
     def act(self, translation_m: ArrayLike, rotation_rad: ArrayLike, *, arrived: bool = False) -> None:
         """Moves the camera. With `arrived` the agent says that it is there with this move. Only the first such claim is
         judged."""
-        self.camera = self._allowed(apply_action(self.camera, translation_m, rotation_rad))
+        before, self.camera = self.camera[:3, 3], apply_action(self.camera, translation_m, rotation_rad)
+        self.camera[:3, 3] = self._allowed(before, self.camera[:3, 3])
         self.step += 1
         self.reached |= self.success
         if arrived and not self.declared:
@@ -175,13 +230,19 @@ class Episode:
     @property
     def goal(self) -> Array:
         """The goal pose [4, 4]. If several views look like the goal image, it is the nearest one to the camera."""
-        return nearest_goal(self.camera, self._goals)
+        return self.views.world_from_camera[self.views.nearest(self.camera)]
+
+    @property
+    def target(self) -> tuple[Array, int]:
+        """The centre [3] of the target that `goal` shows, and its number among those of its kind."""
+        nearest = self.views.nearest(self.camera)
+        return self.views.centers_m[nearest], self.views.instances[nearest]
 
     @property
     def success(self) -> bool:
         """Whether the camera is at the goal now. This is judged after every action, so it is never true at the
         start."""
-        return self.judged and self.step > 0 and success(self.camera, self.goal)
+        return self.judged and self.there and self.step > 0 and success(self.camera, self.goal)
 
     @property
     def done(self) -> bool:

@@ -39,7 +39,8 @@ def story(episodes=2, steps=3):
             camera = camera_at(step, episode)
             yield new(TRUTH, step, names=["mug", "can"], target="mug", centers_m=CENTERS,
                       yaws_rad=np.array([0.5, -1.0]), keep_out_m=np.ones(2), world_from_camera=camera,
-                      goal_world_from_camera=GOAL_CAMERA, done=step == steps)
+                      goal_world_from_camera=GOAL_CAMERA, done=step == steps, instances=np.ones(2, np.uint8),
+                      rotations=None, sizes_m=None, in_view=np.ones(2), events=None)
             if step == steps:
                 yield new(RESULT, step)
                 break
