@@ -2,7 +2,8 @@
 
 The directions are the cells of a grid on the hemisphere above the object. For each view, the CCN's transition moves the
 latent pose of the view to every cell. A cell is as likely as the goal's latent pose is under the moved one (paper,
-equations 2 and 5). The likelihoods of views from different places are multiplied. For a nearly symmetric object the
+equations 2 and 5). A view from about the same direction is also compared with the goal's directly, which tells apart
+sides that look alike. The likelihoods of views from different places are multiplied. For a nearly symmetric object the
 posterior may have several modes; new views decide between them. Percepts that tell rotations in place of a latent pose
 are fused over the turn of the object (`services/belief/turn.py`).
 """
@@ -34,6 +35,12 @@ from saccade.shared.world.symmetry import NONE, turns_of
 Array = NDArray[np.float64]
 
 OUTLIER = 0.05  # chosen: probability that the latent pose of a view says nothing about the goal's direction
+SAME_RAD = 0.25  # chosen: two views within about this angle are compared directly, too
+# Measured between views within 0.35 rad: deviation of a latent pose moved by the change of the transition, for views
+# from the same direction (with half a cell of the grid) and for each radian between them.
+SAME_STD, SAME_STD_PER_RAD = 0.065, 0.35
+DIRECT = 0.9  # chosen: probability that the direct comparison of two views from the same direction holds
+LEAST_SHARE = 1e-3  # chosen: where the direct comparison counts less than this it is left out
 NEW_VIEW_RAD = 0.08  # chosen: two views within this angle count as the same view; a little less than a cell of the grid
 BETTER = 1.2  # chosen: a view replaces the same kept view if its quality is higher by this factor
 CERTAIN = 0.03  # chosen: the quality of a view is its presence / (this + standard deviation of its log scale)
@@ -57,10 +64,15 @@ class Likeness(Protocol):
 
 class LatentLikeness:
     """The likeness by latent poses, directly over the directions of the grid. `goal` is the object's percept in the
-    goal image."""
+    goal image.
 
-    def __init__(self, transition: LatentTransition, goal: Percept):
-        self.transition = transition
+    The transition is the less exact the farther it moves, but its deviation does not become small where it hardly
+    moves. Opposite sides of a can that look nearly alike are within it. So with `direct` the latent pose of a view also
+    moves by no more than the transition changes, from where it is, and with a deviation that grows with the way.
+    """
+
+    def __init__(self, transition: LatentTransition, goal: Percept, *, direct: bool = True):
+        self.transition, self.direct = transition, direct
         self.goal_mean, self.goal_std = np.array(goal.latent_mean), np.array(goal.latent_std)
         elevation, azimuth = viewing_grid()
         self.elevation, self.azimuth = (x.ravel() for x in np.meshgrid(elevation, azimuth, indexing="ij"))
@@ -72,9 +84,23 @@ class LatentLikeness:
         displacement = np.stack([wrap(self.azimuth - azimuth), self.elevation - elevation], axis=-1)
         moved_mean, moved_std = self.transition(percept.latent_mean, displacement)
         score = log_density(self.goal_mean, moved_mean, np.sqrt(moved_std ** 2 + self.goal_std ** 2)).astype(np.float64)
+        if self.direct:
+            score = self._compared(score, percept, displacement, moved_mean)
         share = np.exp(score - score.max())
         share = (1 - OUTLIER) * share / share.sum() + OUTLIER / len(share)
         return np.log(share).reshape(GRID_ELEVATIONS, GRID_AZIMUTHS)
+
+    def _compared(self, score: Array, percept: Percept, displacement: Array, moved_mean: Array) -> Array:
+        """The log densities of the directions [N], mixed with those of the direct comparison where they are near."""
+        way = np.hypot(*displacement.T)  # near the pole, too, a change of azimuth rotates the image
+        share = DIRECT * np.exp(-0.5 * (way / SAME_RAD) ** 2)
+        near = share > LEAST_SHARE
+        start, _ = self.transition(percept.latent_mean, np.zeros((1, 2)))
+        moved = percept.latent_mean + moved_mean[near] - start
+        std = np.hypot(SAME_STD, SAME_STD_PER_RAD * way[near])[:, None]
+        mixed = score + np.log1p(-share)
+        mixed[near] = np.logaddexp(mixed[near], np.log(share[near]) + log_density(self.goal_mean, moved, std))
+        return mixed
 
     def grid(self, log_probability: Array) -> Array:
         """The same, because it is over the grid already."""
