@@ -13,9 +13,9 @@ from saccade.benchmarks.hand import (
     SWAY_RAD,
     Hand,
     Sway,
-    as_measured,
     summary,
 )
+from saccade.benchmarks.hand_eyes import as_measured
 from saccade.shared.world.geometry import INTRINSICS_PX, look_at, rotation_angle
 from saccade.shared.world.guidance import guide
 from saccade.shared.world.task import Spheres, spheres_around, start_pose

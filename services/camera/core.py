@@ -214,5 +214,5 @@ def _notes(virtual_camera: VirtualCamera, lens: Lens | None, *, still: bool) -> 
         x, y, z = start_pose()[:3, 3]
         notes.append(f"camera.poses is not given: the camera is assumed to stand still at ({x:.2f}, {y:.2f}, {z:.2f}) "
                      "m and to look at the table's centre; if it moves or stands elsewhere, the positions of objects "
-                     "and viewpoints are wrong")
+                     "and viewpoints are wrong; `saccade see --map` makes a map of the objects from pictures alone")
     return tuple(notes)
