@@ -63,11 +63,11 @@ def test_one_look_does_not_decide_against_the_others():
 
 
 def test_where_looks_leave_a_doubt_there_are_more_of_them():
-    doubt = {"look": 0.4, "fused": 0.7}
+    doubt = {"look": 0.4, "fused": 0.6}
     assert verdicts(followed(), [at(0)] * MOST_LOOKS, **doubt) == ["stay"] * (MOST_LOOKS - 1) + ["wrong"]
     hand = followed()
     assert set(verdicts(hand, [at(0)] * LOOKS, **doubt)) == {"stay"}
-    assert "there" in verdicts(hand, [at(0)] * LOOKS, look=0.95, fused=0.7)
+    assert "there" in verdicts(hand, [at(0)] * LOOKS, look=0.95, fused=0.6)
 
 
 def test_before_it_decides_the_hand_is_led_to_where_the_goal_is_believed_now():
