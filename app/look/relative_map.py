@@ -38,11 +38,20 @@ class RelativeMap:
         """One line that says what the map is worth."""
         scale = "the scale is that of the objects' sizes, and nothing checks it"
         if self.apart_m is None:
-            return (f"map: {len(self.places)} objects by one picture alone, each by its size in it; an error of its "
-                    f"range is seen by nothing, and {scale}")
+            return (f"map: {len(self.places)} objects by one picture alone, each by its size in it; no other picture "
+                    f"checks them, and {scale}")
         return (f"map: {len(self.places)} objects by {len(self.cameras)} of {pictures} pictures, which put an object "
-                f"{100 * self.apart_m:.1f} cm from its mean place (rms); {scale}. It tells what is beside what, and is "
-                "no substitute for poses")
+                f"{100 * self.apart_m:.1f} cm from its mean place (rms), and so a camera wrong by about "
+                f"{100 * self.cameras_apart_m:.0f} cm; {scale}. It tells what is beside what, and is no substitute for "
+                "poses")
+
+    @property
+    def cameras_apart_m(self) -> float:
+        """About how far the cameras are wrong (metres): the error of the places turns the camera around objects that
+        are near to one line, and it is far from them."""
+        points = np.array([*self.places.values()])
+        away_m = np.mean([np.linalg.norm(camera[:3, 3] - points.mean(0)) for camera in self.cameras.values()])
+        return float(self.apart_m or 0.0) * (1.0 + float(away_m) / max(_spread(points), LEAST_SPREAD_M))
 
     def entry(self, names: Sequence[str]) -> dict[str, Any]:
         """The map as JSON: objects by name, cameras by the pictures' `names`."""

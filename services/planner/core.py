@@ -13,11 +13,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from saccade.services.planner.declaring import Evidence, Rivals, fused_here
+from saccade.services.planner.declaring import UNLIKELY, Evidence, Look, Rivals, fused_here
 from saccade.services.planner.free_energy import Terms, expected_free_energy
 from saccade.services.planner.goal import Preference, aim, infer_preference
 from saccade.services.planner.goal_views import Side, nearest_eye
-from saccade.services.planner.hand import UNLIKELY, Hand
+from saccade.services.planner.hand import Hand
 from saccade.services.planner.motion import step_towards
 from saccade.shared.bus.messages import Action, Belief, Plan
 from saccade.shared.bus.topics import ACTION, BELIEF, GOAL_PERCEPT, PLAN, Output
@@ -136,7 +136,8 @@ class Planner:
             else:
                 evidence = self._evidence(target, camera)
                 declared = evidence.is_enough
-                self._has_looked(target, camera, wrong=not evidence.rival or evidence.look < UNLIKELY)
+                self._has_looked(target, camera, evidence.look,
+                                 wrong=not evidence.rival or evidence.probability < UNLIKELY)
         self.age += 1
         due = chosen is None or arrived or mode != chosen.mode or self.age >= self.config.planner.replan_every
         return due, declared
@@ -153,7 +154,7 @@ class Planner:
         eye = eye if self.wanted is None else None  # whoever looks from elsewhere is not led back before
         verdict = self.hand.take(camera, evidence, eye)
         if verdict in ("wrong", "rival") and target is not None:
-            self._has_looked(target, camera, wrong=verdict == "wrong")
+            self._has_looked(target, camera, self.hand.look, wrong=verdict == "wrong")
         return verdict in ("renew", "wrong", "rival"), verdict == "there"
 
     def _note_rivals(self, beliefs: dict[str, Belief]) -> None:
@@ -163,12 +164,14 @@ class Planner:
             self.rivals.take(beliefs[self.preference.target])
 
     def _evidence(self, target: Belief, camera: Array) -> Evidence:
-        return Evidence(target.goal_here, fused_here(target, camera, self.symmetry[target.object]),
-                        self.rivals.beside(camera, target.mean_m) is not None)
+        fused = fused_here(target, camera, self.symmetry[target.object])
+        return Evidence(Look(target.goal_here, target.goal_unlike), fused,
+                        self.rivals.beside(camera, target.mean_m) is not None,
+                        self.rivals.elsewhere(camera, target.mean_m))
 
-    def _has_looked(self, target: Belief, camera: Array, *, wrong: bool) -> None:
+    def _has_looked(self, target: Belief, camera: Array, look: Look, *, wrong: bool) -> None:
         """The agent has arrived and looked, and goes on: to a rival, if the view may be the goal's all the same."""
-        self.rivals.looked(camera, target.mean_m)
+        self.rivals.looked(camera, target.mean_m, look)
         self.wanted = None if wrong else self.rivals.beside(camera, target.mean_m)
         if wrong and self.config.planner.retry:
             self.visited.append(camera)

@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from saccade.services.planner.declaring import Evidence, together
+from saccade.services.planner.declaring import UNLIKELY, Evidence, Look, mean_of
 from saccade.shared.world.geometry import Array, pose, rotation_angle
 from saccade.shared.world.guidance import NEAR_M, NEAR_RAD
 from saccade.shared.world.task import Spheres, clip, success
@@ -14,7 +14,6 @@ from saccade.shared.world.task import Spheres, clip, success
 Verdict = Literal["stay", "renew", "wrong", "rival", "there"]
 
 LOOKS, MOST_LOOKS = 5, 15  # chosen: at least and at most so many images decide whether a view is the goal's
-UNLIKELY = 0.25  # chosen: a view that has a lower probability is not the goal's
 PATIENCE = 20  # chosen: after so many images within the task's tolerance a hand will not come nearer
 ELSEWHERE_M = 0.15  # chosen: a hand goes elsewhere if it is so much farther from the viewpoint than it has been
 MOVED_M = 0.03  # chosen: a plan is renewed if the believed view of the goal moves by more than this
@@ -37,7 +36,7 @@ class Hand:
         the goal's view is believed to be."""
         self._viewpoint, self._eye = pose(viewpoint[:3, :3], clip(viewpoint[:3, 3], spheres)), eye
         self._nearest_m, self._age = np.inf, 0
-        self._looks: list[float] = []
+        self._looks: list[Look] = []
         return self._viewpoint
 
     def take(self, camera: Array, evidence: Evidence | None, eye: Array | None) -> Verdict:
@@ -70,14 +69,18 @@ class Hand:
 
     def _judge(self, evidence: Evidence) -> Verdict:
         """Whether the view is the goal's, by the looks at it so far; `stay` asks for more of them."""
-        evidence = evidence._replace(look=float(np.mean(self._looks[-MOST_LOOKS:])))
+        evidence = evidence._replace(look=self.look)
         self.there = evidence.is_enough
         if self.there:
             return "there"
-        probability = together(evidence.look, evidence.fused)
-        if evidence.rival and probability >= UNLIKELY:
+        if evidence.rival and evidence.probability >= UNLIKELY:
             return "rival"
-        return "wrong" if probability < UNLIKELY or len(self._looks) >= MOST_LOOKS else "stay"
+        return "wrong" if evidence.probability < UNLIKELY or len(self._looks) >= MOST_LOOKS else "stay"
+
+    @property
+    def look(self) -> Look:
+        """The mean of the looks at the viewpoint so far."""
+        return mean_of(self._looks[-MOST_LOOKS:])
 
     def _has_moved(self, eye: Array | None, by_m: float) -> bool:
         if eye is None or self._eye is None:
