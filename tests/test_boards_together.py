@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,17 +13,16 @@ from scipy.spatial.transform import Rotation
 from saccade.services.camera.board_map import DISAGREE, LOOKS, NO_KNOWN, BoardMap
 from saccade.services.camera.board_pose import Doubtful, Measured
 from saccade.services.camera.board_poses import BoardPoses
-from saccade.services.camera.charuco import Board, read_board, read_boards
+from saccade.services.camera.charuco import read_board, read_boards
 from saccade.services.camera.core import require_one_of_each
 from saccade.services.camera.sources import SourceImage
 from saccade.shared.config import Config
 from saccade.shared.world.geometry import pose, rotation_angle
-from saccade.tests.fakes.board import MARGIN_M, PINHOLE, SHEET, TEXELS_PER_M, printed, seen, view
+from saccade.tests.fakes.board import PINHOLE, SECOND, SHEET, both_on_the_table, view
 from saccade.tests.front_door import call
 from saccade.tests.hostile import complaint
 
 pytest.importorskip("cv2")
-SECOND = Board(squares=(7, 10), square_m=0.025, marker_m=0.019, first_marker=35)
 TURN = Rotation.from_euler("z", 90, degrees=True).as_matrix()
 BESIDE = pose(TURN, (0.30, 0.02, 0.0))  # world_from_board of the second
 NOISE = np.diag(np.repeat([0.0007, 0.0015], 3) ** 2)
@@ -85,18 +83,6 @@ def test_a_board_that_moves_while_it_is_learnt_stays_unknown():
         camera = view(10 * step, 50, 0.5)
         boards.fuse([measured(camera), measured(camera, pose(TURN, (0.3, 0.02 * step, 0.0)))])
     assert list(boards.known) == [0]
-
-
-def both_on_the_table(world_from_camera) -> np.ndarray:
-    """The image of both sheets, painted onto one."""
-    sheets, width = [printed(SHEET), np.rot90(printed(SECOND))], 0.56
-    canvas = np.full((round(0.30 * TEXELS_PER_M), round(width * TEXELS_PER_M)), 0.55, np.float32)
-    for sheet, (x, y) in zip(sheets, ((0.12, 0.15), (0.42, 0.13)), strict=True):
-        top, left = (round(TEXELS_PER_M * at) - side // 2 for at, side in zip((y, x), sheet.shape, strict=True))
-        canvas[top:top + sheet.shape[0], left:left + sheet.shape[1]] = sheet
-    whole = SimpleNamespace(size_m=np.array([width, 0.30]) - 2 * MARGIN_M)
-    moved = pose(world_from_camera[:3, :3], world_from_camera[:3, 3] - (width / 2 - 0.12, 0.0, 0.0))
-    return seen(moved, board=whole, sheet=canvas)
 
 
 def test_images_of_two_boards_give_poses_where_only_the_second_is_seen():

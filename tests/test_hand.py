@@ -7,7 +7,7 @@ import pytest
 
 from saccade.app.run.run import in_world
 from saccade.services.planner.core import build
-from saccade.services.planner.declaring import Evidence, Look
+from saccade.services.planner.declaring import Evidence
 from saccade.services.planner.hand import ELSEWHERE_M, LOOKS, MOST_LOOKS, MOVED_M, PATIENCE, SHIFTED_M, Hand
 from saccade.shared.bus.messages import Belief, Percept
 from saccade.shared.config import Config
@@ -32,7 +32,7 @@ def followed(spheres=FREE) -> Hand:
 
 
 def verdicts(hand, poses, look=0.9, eye=EYE, fused=0.9, rival=False) -> list[str]:
-    return [hand.take(camera, look and Evidence(Look(look), fused, rival), eye) for camera in poses]
+    return [hand.take(camera, look and Evidence(look, fused, rival), eye) for camera in poses]
 
 
 def test_the_plan_waits_for_the_hand():
@@ -58,7 +58,7 @@ def test_several_looks_and_all_views_together_decide_whether_it_is_the_goal(look
 
 def test_one_look_does_not_decide_against_the_others():
     hand = followed()
-    looks = [hand.take(at(0), Evidence(Look(look), 0.9), EYE) for look in (0.9, 0.9, 0.1, 0.9, 0.9)]
+    looks = [hand.take(at(0), Evidence(look, 0.9), EYE) for look in (0.9, 0.9, 0.1, 0.9, 0.9)]
     assert looks[-1] == "there"
 
 

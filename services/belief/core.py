@@ -98,15 +98,14 @@ class BeliefFilter:
             position.missed(visible, rng)
         mean, covariance = position.moments()
         goal_view = self.goal_views.get(name)
-        posterior, goal_range_m, goal_here, unlike = None, 0.0, 0.0, 0.0
+        posterior, goal_range_m, goal_here = None, 0.0, 0.0
         if goal_view is not None:
             if name in present and np.trace(covariance) < LOCALISED_M ** 2:
                 goal_view.seen(percept, mean)
             posterior = goal_view.log_posterior()
             if posterior is not None:
                 goal_range_m = goal_view.range_m(posterior)
-                if name in present:
-                    goal_here, unlike = goal_view.here(percept), goal_view.likeness.unlike(percept)
+                goal_here = goal_view.here(percept) if name in present else 0.0
         energy = self._free_energy(percept, prior, before, (mean, covariance), name in present)
         return Belief(
             run=percept.run, episode=percept.episode, step=percept.step, object=name, presence=position.presence,
@@ -114,8 +113,7 @@ class BeliefFilter:
             particles_m=position.sample(self.config.belief.published_particles, rng).astype(np.float32),
             views=len(goal_view.keyframes) if goal_view else 0,
             goal_log_posterior=None if posterior is None else posterior.astype(np.float32),
-            goal_range_m=goal_range_m, goal_here=goal_here, goal_unlike=unlike,
-            **energy)
+            goal_range_m=goal_range_m, goal_here=goal_here, **energy)
 
     def _free_energy(self, percept: Percept, prior: float, before: Moments, after: Moments,
                      present: bool) -> Energy:

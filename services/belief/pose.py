@@ -61,9 +61,6 @@ class Likeness(Protocol):
     def grid(self, log_probability: Array) -> Array:
         """Log probabilities of the directions of the viewing grid [E, A], from fused ones of that something."""
 
-    def unlike(self, percept: Percept) -> float:
-        """How unlike the goal image a view is. 0 if that is not known."""
-
 
 class LatentLikeness:
     """The likeness by latent poses, directly over the directions of the grid. `goal` is the object's percept in the
@@ -94,10 +91,6 @@ class LatentLikeness:
         share = np.exp(score - score.max())
         share = (1 - OUTLIER) * share / share.sum() + OUTLIER / len(share)
         return np.log(share).reshape(GRID_ELEVATIONS, GRID_AZIMUTHS)
-
-    def unlike(self, percept: Percept) -> float:
-        """The root mean square difference of the latent poses."""
-        return float(np.sqrt(np.mean((self.goal_mean - percept.latent_mean) ** 2)))
 
     def _compared(self, score: Array, percept: Percept, displacement: Array, moved_mean: Array) -> Array:
         """The log densities of the directions [N], less where they are near and the view is unlike the goal."""
@@ -131,10 +124,6 @@ class TurnLikeness:
     def grid(self, log_probability: Array) -> Array:
         """Log probabilities of the directions of the grid [E, A]."""
         return np.log(self.directions.of(np.exp(log_probability)))
-
-    def unlike(self, percept: Percept) -> float:
-        """0: rotations do not tell it."""
-        return 0.0
 
 
 @dataclass(eq=False)

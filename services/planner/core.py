@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from saccade.services.planner.declaring import UNLIKELY, Evidence, Look, Rivals, fused_here
+from saccade.services.planner.declaring import UNLIKELY, Evidence, Rivals, fused_here
 from saccade.services.planner.free_energy import Terms, expected_free_energy
 from saccade.services.planner.goal import Preference, aim, infer_preference
 from saccade.services.planner.goal_views import Side, nearest_eye
@@ -165,11 +165,11 @@ class Planner:
 
     def _evidence(self, target: Belief, camera: Array) -> Evidence:
         fused = fused_here(target, camera, self.symmetry[target.object])
-        return Evidence(Look(target.goal_here, target.goal_unlike), fused,
+        return Evidence(target.goal_here, fused,
                         self.rivals.beside(camera, target.mean_m) is not None,
                         self.rivals.elsewhere(camera, target.mean_m))
 
-    def _has_looked(self, target: Belief, camera: Array, look: Look, *, wrong: bool) -> None:
+    def _has_looked(self, target: Belief, camera: Array, look: float, *, wrong: bool) -> None:
         """The agent has arrived and looked, and goes on: to a rival, if the view may be the goal's all the same."""
         self.rivals.looked(camera, target.mean_m, look)
         self.wanted = None if wrong else self.rivals.beside(camera, target.mean_m)

@@ -2,13 +2,11 @@
 
 Two things must agree: the looks from there, and what all views together say. Where another direction was once about as
 likely, as with the two sides of a can, the agent looks from there too before it says so, unless the looks are clear. If
-the looks from both sides are good, those that are more like the goal image decide: of all views there are more from
-where it was longer.
+the looks from both sides are good, the better ones decide: of all views there are more from where it was longer.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -20,48 +18,29 @@ from saccade.shared.world.geometry import Array, direction, unit, viewing_grid
 SURE = 0.6  # chosen: the agent says so if looks and fused views together leave at least this probability
 UNLIKELY = 0.25  # chosen: a view that has a lower probability is not the goal's
 CLEAR = 0.93  # chosen: looks that are clearer than this need no look at rivals; a view that may be wrong reaches 0.95
-SHARP = 6  # chosen: a look that is half as unlike the goal image is 64 times as probable
 FLOOR = 0.02  # chosen: neither the looks nor the fused views count as surer than this leaves
 RIVAL = 0.25  # chosen: a direction with this probability around it is a rival of the likeliest one
 AROUND_RAD, APART_RAD = 0.4, 0.8  # chosen: what counts as around a direction, and how far rivals are from one another
 
 
-class Look(NamedTuple):
-    """What one look or the mean of several says: the probability that the goal's view is there, and how unlike the goal
-    image the target looks (0 if that is not known)."""
-
-    here: float
-    unlike: float = 0.0
-
-
-def mean_of(looks: Sequence[Look]) -> Look:
-    """The mean of looks. Nothing speaks for the goal's view before the first."""
-    return Look(*(float(mean) for mean in np.mean(looks, axis=0))) if looks else Look(0.0)
-
-
 class Evidence(NamedTuple):
-    """What speaks for the goal's view being here: the look from here, the probability by all views, whether a rival
-    direction is left from which the agent has not looked, and the best look from elsewhere."""
+    """What speaks for the goal's view being here: the probability by the looks from here, that by all views, whether a
+    rival direction is left from which the agent has not looked, and the probability by the best looks elsewhere."""
 
-    look: Look
+    look: float
     fused: float
     rival: bool = False
-    elsewhere: Look | None = None
+    elsewhere: float = 0.0
 
     @property
     def probability(self) -> float:
         """The probability that the goal's view is here."""
-        if self.elsewhere is None or self.elsewhere.here < UNLIKELY:
-            return together(self.look.here, self.fused)
-        likeness = 0.5
-        if min(self.look.unlike, self.elsewhere.unlike) > 0:
-            likeness = 1 / (1 + (self.look.unlike / self.elsewhere.unlike) ** SHARP)
-        return together(together(self.look.here, 1.0 - self.elsewhere.here), likeness)
+        return together(self.look, self.fused if self.elsewhere < UNLIKELY else 1.0 - self.elsewhere)
 
     @property
     def is_enough(self) -> bool:
         """Whether the agent says that the camera is there."""
-        return self.probability > SURE and (self.look.here > CLEAR or not self.rival)
+        return self.probability > SURE and (self.look > CLEAR or not self.rival)
 
 
 def together(looks: float, fused: float) -> float:
@@ -85,7 +64,7 @@ class Rivals:
 
     def __init__(self) -> None:
         self.directions: list[Array] = []
-        self._seen: list[tuple[Array, Look]] = []  # directions, and the looks from there
+        self._seen: list[tuple[Array, float]] = []  # directions, and the looks from there
 
     def take(self, target: Belief) -> None:
         """Takes the directions that are likely by now: the likeliest, and the likeliest that is far from it."""
@@ -104,16 +83,16 @@ class Rivals:
                 self.directions.append(peak)
             left &= towards @ peak < np.cos(APART_RAD)
 
-    def looked(self, camera: Array, center: Array, look: Look) -> None:
-        """The agent has looked at the target from the pose of a camera [4, 4]."""
+    def looked(self, camera: Array, center: Array, look: float) -> None:
+        """The agent has looked at the target from the pose of a camera [4, 4]: the probability by these looks."""
         here = unit(camera[:3, 3] - center)
         self._seen = [each for each in self._seen if each[0] @ here < np.cos(AROUND_RAD)] + [(here, look)]
         self.directions = [each for each in self.directions if each @ here < np.cos(APART_RAD)]
 
-    def elsewhere(self, camera: Array, center: Array) -> Look | None:
-        """The best look from a direction far from that of a camera [4, 4]. None if there was none."""
+    def elsewhere(self, camera: Array, center: Array) -> float:
+        """The best look from a direction far from that of a camera [4, 4]. 0 if there was none."""
         here = unit(camera[:3, 3] - center)
-        return max((look for seen, look in self._seen if seen @ here < np.cos(APART_RAD)), default=None)
+        return max((look for seen, look in self._seen if seen @ here < np.cos(APART_RAD)), default=0.0)
 
     def beside(self, camera: Array, center: Array) -> Array | None:
         """A rival [3] of the direction of a camera [4, 4]. None if there is none."""

@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from saccade.services.planner.declaring import UNLIKELY, Evidence, Look, mean_of
+from saccade.services.planner.declaring import UNLIKELY, Evidence
 from saccade.shared.world.geometry import Array, pose, rotation_angle
 from saccade.shared.world.guidance import NEAR_M, NEAR_RAD
 from saccade.shared.world.task import Spheres, clip, success
@@ -36,7 +36,7 @@ class Hand:
         the goal's view is believed to be."""
         self._viewpoint, self._eye = pose(viewpoint[:3, :3], clip(viewpoint[:3, 3], spheres)), eye
         self._nearest_m, self._age = np.inf, 0
-        self._looks: list[Look] = []
+        self._looks: list[float] = []
         return self._viewpoint
 
     def take(self, camera: Array, evidence: Evidence | None, eye: Array | None) -> Verdict:
@@ -78,9 +78,9 @@ class Hand:
         return "wrong" if evidence.probability < UNLIKELY or len(self._looks) >= MOST_LOOKS else "stay"
 
     @property
-    def look(self) -> Look:
-        """The mean of the looks at the viewpoint so far."""
-        return mean_of(self._looks[-MOST_LOOKS:])
+    def look(self) -> float:
+        """The mean of the looks at the viewpoint so far. 0 before the first."""
+        return float(np.mean(self._looks[-MOST_LOOKS:])) if self._looks else 0.0
 
     def _has_moved(self, eye: Array | None, by_m: float) -> bool:
         if eye is None or self._eye is None:

@@ -147,9 +147,6 @@ class Belief(Message):
     """Range at which the goal image shows the object, by the measure of similar views. 0 without a posterior."""
     goal_here: float = 0.0
     """Probability, by the present view alone, that the goal image was taken from about this direction."""
-    goal_unlike: float = 0.0
-    """How unlike the goal image the object looks in the present view: root mean square difference of the latent poses.
-    0 if they are not compared."""
     f_pose: float = 0.0
     """Term of the variational free energy (paper, appendix A), nats: the latent pose."""
     f_identity: float = 0.0
