@@ -201,6 +201,15 @@ def summary(records: list[dict[str, Any]]) -> dict[str, Any]:
                                 for key in ("seconds", "viewpoints", "metres")}}
 
 
+def rehearsed(out: Path, *, seed: int, board: bool) -> dict[str, dict[str, Any]]:
+    """The records that a file holds, by their scenes. What has another seed or other poses is not of these rehearsals,
+    and is written over."""
+    told = json.loads(out.read_text()) if out.is_file() else {}
+    if (told.get("seed"), told.get("board", False)) != (seed, board):
+        return {}
+    return {record["scene"]: record for record in told["rehearsals"]}
+
+
 def main(out: Path, count: int = REHEARSALS, *, seed: int = SEED, board: bool = False) -> None:
     """Rehearses in scenes that are chosen evenly, prints a line for each rehearsal, and writes the results after each.
     The summary is that of the chosen scenes. With another `seed` the scenes and the hand are others; with `board` the
@@ -210,7 +219,7 @@ def main(out: Path, count: int = REHEARSALS, *, seed: int = SEED, board: bool = 
                                    "planner.moved_by": "hand", "seed": seed})
     meshes = tuple(load_mesh(OBJECTS, name) for name in names)
     scenes = generate_split({mesh.name: mesh.size_m for mesh in meshes}, seed=seed, repeats=REPEATS, yaw="fixed")
-    records = {r["scene"]: r for r in json.loads(out.read_text())["rehearsals"]} if out.is_file() else {}
+    records = rehearsed(out, seed=seed, board=board)
     chosen = np.linspace(0, len(scenes) - 1, min(count, len(scenes))).round().astype(int)
     world, pairs, code = World(meshes), agent_pairs("sceneccn", config), commit()
     film = Film((*meshes, *sheets()), RENDER_PX) if board else None

@@ -87,7 +87,7 @@ class LatentLikeness:
         moved_mean, moved_std = self.transition(percept.latent_mean, displacement)
         score = log_density(self.goal_mean, moved_mean, np.sqrt(moved_std ** 2 + self.goal_std ** 2)).astype(np.float64)
         if self.direct:
-            score = self._compared(score, percept, displacement, moved_mean)
+            score = self._compared(score, percept, displacement, moved_mean.astype(np.float64))
         share = np.exp(score - score.max())
         share = (1 - OUTLIER) * share / share.sum() + OUTLIER / len(share)
         return np.log(share).reshape(GRID_ELEVATIONS, GRID_AZIMUTHS)

@@ -79,7 +79,8 @@ def _moved(world_from_board: Array, covariance: Array, measured: Measured) -> Me
     lever = np.eye(6)
     lever[:3, 3:] = -_cross(arm)  # what a turn of the board does to the camera's position
     total = both @ measured.covariance @ both.T + lever @ covariance @ lever.T
-    return Measured(world_from_board @ measured.world_from_camera, total, measured.rms_px, measured.corners)
+    return Measured(world_from_board @ measured.world_from_camera, np.asarray(total, dtype=np.float64),
+                    measured.rms_px, measured.corners)
 
 
 def _cross(vector: Array) -> Array:
