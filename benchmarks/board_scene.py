@@ -29,40 +29,49 @@ RATE_HZ, EXPOSURE_S, EXPOSURES = 30.0, 0.012, 4
 RENDER_PX, RENDER_TANGENT = 1100, 0.66  # side of the rendered image, and how far it sees beside its axis at depth 1
 NOISE, CRF = 4.0, "26"  # of 255; the quality of H.264, of which phones use about 20
 TEXELS_PER_M, MARGIN_M, THICK_M = 6000.0, 0.01, 0.0005
+SHEET_Z_M = -THICK_M / 2 + 0.0001
 LOOK = "lamp"
 BESIDE = {"coffee_can": (0.17, 0.10), "rice_box": (-0.18, -0.02)}
 
 
-class Scene:
-    """The board, flat on a table, with two objects beside it."""
+class Film:
+    """A world of these meshes, filmed by a camera with faults."""
 
-    def __init__(self, board: Board = BOARD):
-        meshes = (_sheet(board), *(load_mesh("pantry", name) for name in BESIDE))
-        focal = RENDER_PX / 2 / RENDER_TANGENT
-        self._world = World(meshes, size_px=RENDER_PX, intrinsics_px=(focal, focal, RENDER_PX / 2, RENDER_PX / 2))
-        self._world.set_look(load_look(LOOK))
-        self._world.place({"board": ((0.0, 0.0, -THICK_M / 2 + 0.0001), 0.0)} | {
-            mesh.name: ((*BESIDE[mesh.name], mesh.size_m[2] / 2), 0.6) for mesh in meshes[1:]})
+    def __init__(self, meshes: tuple[Mesh, ...], render_px: int = RENDER_PX):
+        focal = render_px / 2 / RENDER_TANGENT
+        self.world = World(meshes, size_px=render_px, intrinsics_px=(focal, focal, render_px / 2, render_px / 2))
         u, v = np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5)
         rays = LENS.rays(np.stack([u, v], axis=-1).reshape(-1, 2)).reshape(*SIZE[::-1], 2)
-        places = (focal * rays + RENDER_PX / 2 - 0.5).astype(np.float32)
+        places = (focal * rays + render_px / 2 - 0.5).astype(np.float32)
         self._u, self._v = places[..., 0].copy(), places[..., 1].copy()
         away = (u / SIZE[0] - 0.3) ** 2 + (v / SIZE[1] - 0.3) ** 2
         self._light = (1.0 - 0.35 * away)[..., None]  # it falls towards a corner
 
-    def seen(self, poses: Iterable[Array], rng: np.random.Generator) -> NDArray[np.uint8]:
-        """The image [480, 640, 3] of an exposure during which the camera has these poses [4, 4]."""
-        light = np.mean([cv2.remap(self._world.render(one), self._u, self._v, cv2.INTER_LINEAR).astype(np.float64)
+    def seen(self, poses: Iterable[Array], rng: np.random.Generator, gain: float = 1.0) -> NDArray[np.uint8]:
+        """The image [480, 640, 3] of an exposure during which the camera has these poses [4, 4]. `gain` is how bright
+        it is."""
+        light = gain * np.mean([cv2.remap(self.world.render(one), self._u, self._v, cv2.INTER_LINEAR).astype(float)
                          for one in poses], axis=0)
         return np.clip(light * self._light + rng.normal(0, NOISE, light.shape), 0, 255).round().astype(np.uint8)
 
     def close(self) -> None:
         """Frees the OpenGL context."""
-        self._world.close()
+        self.world.close()
 
 
-def _sheet(board: Board) -> Mesh:
-    """A thin slab with the printed sheet on its top."""
+class Scene(Film):
+    """The board, flat on a table, with two objects beside it."""
+
+    def __init__(self, board: Board = BOARD):
+        meshes = (sheet(board), *(load_mesh("pantry", name) for name in BESIDE))
+        super().__init__(meshes)
+        self.world.set_look(load_look(LOOK))
+        self.world.place({"board": ((0.0, 0.0, SHEET_Z_M), 0.0)} | {
+            mesh.name: ((*BESIDE[mesh.name], mesh.size_m[2] / 2), 0.6) for mesh in meshes[1:]})
+
+
+def sheet(board: Board, name: str = "board") -> Mesh:
+    """A thin slab with the printed sheet on its top, whose middle lies at SHEET_Z_M."""
     grey = grey_of(board, texels_per_m=TEXELS_PER_M, margin_m=MARGIN_M)
     x, y = board.size_m / 2 + MARGIN_M
     z = THICK_M / 2
@@ -70,7 +79,7 @@ def _sheet(board: Board) -> Mesh:
     top, bottom = [(a, b, z) for a, b in corners], [(a, b, -z) for a, b in corners]
     faces = [(0, 1, 2), (0, 2, 3), (4, 6, 5), (4, 7, 6)]
     faces += [face for k in range(4) for face in ((4 + k, 4 + (k + 1) % 4, (k + 1) % 4), (4 + k, (k + 1) % 4, k))]
-    return Mesh("board", np.array(top + bottom, dtype=np.float32),
+    return Mesh(name, np.array(top + bottom, dtype=np.float32),
                 np.array([(0, 0), (1, 0), (1, 1), (0, 1)] + [(0, 0)] * 4, dtype=np.float32),
                 np.array(faces, dtype=np.int32), np.repeat(grey[..., None], 3, axis=2))
 

@@ -1,14 +1,16 @@
-"""`python -m saccade.benchmarks.hand FILE [N]` rehearses N searches in which a simulated hand follows the guidance.
+"""`python -m saccade.benchmarks.hand FILE [N] [--seed S] [--board]` rehearses N searches in which a simulated hand
+follows the guidance.
 
 The hand holds the camera of the simulator. It does what the guidance says half a second later, with the speed of a
-person and a person's sway, and the agent gets poses that are as inexact as those of a printed board. What FILE holds
-already is not rehearsed again.
+person and a person's sway, and the agent gets poses that are as inexact as those of a printed board. With `--board` it
+gets them from printed boards in the image of a camera with faults (see `hand_eyes.py`). What FILE holds already is not
+rehearsed again.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
-import sys
 import time
 from collections import deque
 from itertools import pairwise
@@ -20,6 +22,8 @@ from scipy.spatial.transform import Rotation
 
 from saccade.app.bench.table import wilson
 from saccade.app.run.registry import agent_pairs
+from saccade.benchmarks.board_scene import Film
+from saccade.benchmarks.hand_eyes import RENDER_PX, Eyes, Filmed, Ideal, sheets
 from saccade.services.simulator.scenes import Scene, generate_split
 from saccade.shared.bus.messages import Action, Frame, Goal, Message, Plan
 from saccade.shared.bus.topics import FRAME, GOAL, Output, Topic
@@ -34,15 +38,14 @@ from saccade.shared.world.geometry import IMAGE_SIZE_PX, Array, pose, rotation_a
 from saccade.shared.world.guidance import Guidance, guide, level_axes
 from saccade.shared.world.task import Spheres, clip, equal_goals, nearest_goal, spheres_around, start_pose, success
 
-OBJECTS, SEED, REPEATS, REHEARSALS = "ycb", 14_142_135, 2, 50
+OBJECTS, SEED, REPEATS, REHEARSALS = "ycb", 17_320_508, 2, 50
 RATE_HZ, LONGEST_S = 10.0, 60.0
 ANSWERED_EVERY = 2  # images; the agent's answer comes as many images later
 REACTION_S = 0.5
 SPEED_M_S, TURN_RAD_S = 0.2, np.radians(40)
 EASE_S = 1.0  # near its aim the hand becomes slower: what is left is done in about this time
 SWAY_M, SWAY_RAD, SWAY_HZ, SWAYS = 0.02, np.radians(3), (0.15, 1.0), 3  # root mean square of the whole displacement
-POSE_M, POSE_RAD = 0.0007, np.radians(0.06)  # median error of a board's poses (results/benchmarks/board.json)
-MEDIAN_OF_THREE = 1.538  # median length of three standard normal numbers
+LOST_S = 1.0  # after this time without a pose the hand goes back to where there was one, as the page asks for
 
 
 class Sway:
@@ -92,18 +95,14 @@ def _limited(vector: Array, most: float) -> Array:
     return vector * min(1.0, most / max(length, 1e-9))
 
 
-def as_measured(camera: Array, rng: np.random.Generator) -> Array:
-    """A camera's pose [4, 4] with the error of a board's poses."""
-    turned = Rotation.from_rotvec(rng.normal(0, POSE_RAD / MEDIAN_OF_THREE, 3)).as_matrix()
-    return pose(turned @ camera[:3, :3], camera[:3, 3] + rng.normal(0, POSE_M / MEDIAN_OF_THREE, 3))
-
-
 class Rehearsal:
-    """One search. `pairs` are the agent's services."""
+    """One search. `pairs` are the agent's services. With a `film`, the camera's images and poses are those of the
+    film; otherwise the images are the simulator's."""
 
     def __init__(self, world: World, scene: Scene, pairs: list[tuple[Service, Core]], names: tuple[str, ...],
-                 number: int):
-        self.world, self.scene, self._rng = world, scene, np.random.default_rng((SEED, number))
+                 number: int, *, seed: int = SEED, film: Film | None = None):
+        self.world, self.scene, self._rng = world, scene, np.random.default_rng((seed, number))
+        self.eyes: Eyes = Ideal(world, self._rng) if film is None else Filmed(film, scene, world.meshes, self._rng)
         self._at: dict[str, Any] = {"run": "hand", "episode": number}
         self._pump = Pump([Stepper(service, core, names, live=True) for service, core in pairs], self._hear)
         placed, meshes = scene.on_table, world.meshes
@@ -119,6 +118,7 @@ class Rehearsal:
         self._begin()
         hand = Hand(start_pose(), self.spheres, self._rng)
         path, viewpoints, reached, told = [hand.camera], 0, False, None
+        seen = None  # the camera's pose as it was measured last, as it was then, and when
         started_s, images = time.perf_counter(), round(LONGEST_S * RATE_HZ)
         for step in range(images):
             if self.plan is not None and step % ANSWERED_EVERY == 0:  # this answers the image before the last
@@ -127,21 +127,29 @@ class Rehearsal:
             reached |= step > 0 and self._there(hand.camera)
             if told is not None and told[0].arrived:
                 break
-            measured = as_measured(hand.camera, self._rng)
             if step % ANSWERED_EVERY == 0:
-                self._look(hand.camera, measured, step)
-            if told is not None:
-                hand.follow(self._guidance(measured, *told))
+                measured = self._look(path[-min(2, len(path))], hand.camera, step)
+                seen = seen if measured is None else (measured, hand.camera, step)
+            if seen is not None and step - seen[2] > LOST_S * RATE_HZ:
+                hand.follow(guide(hand.camera, seen[1], self.scene.target_placed.center_m, self.world.intrinsics_px,
+                                  (IMAGE_SIZE_PX,) * 2))
+            elif told is not None and seen is not None:
+                # What a person sees on the screen moves with the image, also between two measured poses.
+                hand.follow(self._guidance(seen[0] @ np.linalg.inv(seen[1]) @ hand.camera, *told))
             path.append(hand.camera)
         declared = told is not None and told[0].arrived
         goal, metres = nearest_goal(hand.camera, self.goals), sum(
             float(np.linalg.norm(after[:3, 3] - before[:3, 3])) for before, after in pairwise(path))
+        by_board = {} if not isinstance(self.eyes, Filmed) else {
+            "images": self.eyes.images, "with_pose": len(self.eyes.apart_m),
+            "pose_apart_m": None if not self.eyes.apart_m else {
+                "median": round(float(np.median(self.eyes.apart_m)), 4), "most": round(max(self.eyes.apart_m), 4)}}
         return {"scene": self.scene.id, "reached": bool(reached), "declared": declared,
                 "declared_rightly": declared and self._there(hand.camera),
                 "seconds": round((len(path) - 1) / RATE_HZ, 1), "viewpoints": viewpoints, "metres": round(metres, 2),
                 "apart_m": round(float(np.linalg.norm(hand.camera[:3, 3] - goal[:3, 3])), 3),
                 "apart_rad": round(float(rotation_angle(hand.camera[:3, :3], goal[:3, :3])), 3),
-                "computed_s": round(time.perf_counter() - started_s, 1)}
+                "computed_s": round(time.perf_counter() - started_s, 1), **by_board}
 
     def _begin(self) -> None:
         target = self.scene.target_placed
@@ -153,10 +161,13 @@ class Rehearsal:
     def _place(self, objects: Any) -> None:
         self.world.place({p.name: (p.center_m, p.yaw_rad) for p in objects}, self.scene.table_rgb)
 
-    def _look(self, camera: Array, measured: Array, step: int) -> None:
-        self._pump.run([Output(FRAME, Frame(
-            **self._at, step=step, rgb=self.world.render(camera), intrinsics_px=self.world.intrinsics_px,
-            world_from_camera=measured))])
+    def _look(self, before: Array, camera: Array, step: int) -> Array | None:
+        """Shows the agent an image, if its pose is known. Returns the pose as it is measured."""
+        rgb, measured = self.eyes.look(before, camera, step / RATE_HZ)
+        if measured is not None:
+            self._pump.run([Output(FRAME, Frame(**self._at, step=step, rgb=rgb, world_from_camera=measured,
+                                                intrinsics_px=self.world.intrinsics_px))])
+        return measured
 
     def _hear(self, _topic: Topic, _part: str | None, message: Message, _payload: bytes | None) -> None:
         if isinstance(message, Plan):
@@ -190,29 +201,51 @@ def summary(records: list[dict[str, Any]]) -> dict[str, Any]:
                                 for key in ("seconds", "viewpoints", "metres")}}
 
 
-def main(out: Path, count: int = REHEARSALS) -> None:
+def rehearsed(out: Path, *, seed: int, board: bool) -> dict[str, dict[str, Any]]:
+    """The records that a file holds, by their scenes. What has another seed or other poses is not of these rehearsals,
+    and is written over."""
+    told = json.loads(out.read_text()) if out.is_file() else {}
+    if (told.get("seed"), told.get("board", False)) != (seed, board):
+        return {}
+    return {record["scene"]: record for record in told["rehearsals"]}
+
+
+def main(out: Path, count: int = REHEARSALS, *, seed: int = SEED, board: bool = False) -> None:
     """Rehearses in scenes that are chosen evenly, prints a line for each rehearsal, and writes the results after each.
-    The summary is that of the chosen scenes."""
+    The summary is that of the chosen scenes. With another `seed` the scenes and the hand are others; with `board` the
+    poses come from boards in the image."""
     names = names_of(OBJECTS)
     config = Config().with_values({"scene.objects": OBJECTS, "scene.names": list(names), "bus.kind": "local",
-                                   "planner.moved_by": "hand", "seed": SEED})
+                                   "planner.moved_by": "hand", "seed": seed})
     meshes = tuple(load_mesh(OBJECTS, name) for name in names)
-    scenes = generate_split({mesh.name: mesh.size_m for mesh in meshes}, seed=SEED, repeats=REPEATS, yaw="fixed")
-    records = {r["scene"]: r for r in json.loads(out.read_text())["rehearsals"]} if out.is_file() else {}
+    scenes = generate_split({mesh.name: mesh.size_m for mesh in meshes}, seed=seed, repeats=REPEATS, yaw="fixed")
+    records = rehearsed(out, seed=seed, board=board)
     chosen = np.linspace(0, len(scenes) - 1, min(count, len(scenes))).round().astype(int)
     world, pairs, code = World(meshes), agent_pairs("sceneccn", config), commit()
+    film = Film((*meshes, *sheets()), RENDER_PX) if board else None
     out.parent.mkdir(parents=True, exist_ok=True)
     for number in map(int, chosen):
         scene = scenes[number]
         if scene.id not in records:
-            records[scene.id] = {**Rehearsal(world, scene, pairs, names, number).run(), "commit": code}
+            rehearsal = Rehearsal(world, scene, pairs, names, number, seed=seed, film=film)
+            records[scene.id] = {**rehearsal.run(), "commit": code}
             print(json.dumps(records[scene.id]), flush=True)
         told = summary([records[scenes[k].id] for k in chosen if scenes[k].id in records])
-        result = {"objects": OBJECTS, "seed": SEED, "longest_s": LONGEST_S, "chosen": len(chosen), "summary": told,
-                  "rehearsals": [*records.values()]}
+        result = {"objects": OBJECTS, "seed": seed, "board": board, "longest_s": LONGEST_S, "chosen": len(chosen),
+                  "summary": told, "rehearsals": [*records.values()]}
         out.write_text(json.dumps(result, indent=1) + "\n")
     print(json.dumps(told, indent=1))
 
 
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m saccade.benchmarks.hand", description=__doc__.splitlines()[0])
+    parser.add_argument("out", type=Path, metavar="FILE", help="file of the results")
+    parser.add_argument("count", type=int, nargs="?", default=REHEARSALS, metavar="N", help="how many rehearsals")
+    parser.add_argument("--seed", type=int, default=SEED, help="of the scenes and of the hand")
+    parser.add_argument("--board", action="store_true", help="poses from boards in the image of a camera with faults")
+    return parser
+
+
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), *map(int, sys.argv[2:3]))
+    given = _parser().parse_args()
+    main(given.out, given.count, seed=given.seed, board=given.board)

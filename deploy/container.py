@@ -30,7 +30,7 @@ from saccade.shared.loop.process import EXIT_ERROR, HEARTBEAT_VARIABLE, LAUNCHER
 RUNS_VARIABLE, HEARTBEATS_VARIABLE = "SACCADE_RUNS", "SACCADE_HEARTBEATS"
 WORLD_VARIABLE, WAIT_VARIABLE = "SACCADE_WORLD", "SACCADE_WAIT"
 LATEST, OVER = "latest", "over"  # a link to the newest run, and a mark in the folder of a world that is over
-ONE_FOR_ALL = ("router", "viewer")  # all worlds share the router, and the viewer shows the first world
+ONE_FOR_ALL = ("router", "viewer", "guide", "ros")  # all worlds share the router, and the others show the first world
 VIEW_VARIABLE, VIEW_S = "SACCADE_VIEW_S", 300.0  # the viewer stays so long after a run
 POLL_S = 0.2
 ROUTER_S = 60.0  # a service waits so long for the router, because containers start in any order

@@ -30,7 +30,8 @@ from saccade.app.run.registry import AGENTS, DEFAULT_WORLD, WORLDS, agent_proces
 from saccade.app.run.summary import summary
 from saccade.app.run.supervisor import HUNG_S, Process
 from saccade.deploy.container import LATEST, OVER, ROUTER_S, heartbeat_file, runs_folder
-from saccade.services.viewer.server import url_of
+from saccade.services.camera.sources import ROS_PREFIX, is_live
+from saccade.services.viewer.server import guide_url_of, url_of
 from saccade.shared.admission import with_token
 from saccade.shared.bus.messages import Message, Result
 from saccade.shared.bus.topics import BELIEF, FRAME, PLAN, RESULT, STATUS, TRUTH, Topic
@@ -44,9 +45,7 @@ SHOWN = (PLAN, BELIEF, STATUS, RESULT)
 BEAT_S = 0.5
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    """Directs one run. If the run cannot be prepared or does not come to its end, it prints one line and ends with exit
-    code 2."""
+def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m saccade.deploy.director", description=__doc__.splitlines()[0])
     parser.add_argument("--endpoint", default="tcp/127.0.0.1:7447", help="the router's address, for the services")
     parser.add_argument("--listen", help="the address at which the router listens, if it is another one")
@@ -57,29 +56,59 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--count", type=int, default=None, help="number of scenes, one after the other")
     parser.add_argument("--worlds", type=int, default=1, help="number of worlds, side by side")
     parser.add_argument("--world", default=DEFAULT_WORLD, help=f"one of {', '.join(WORLDS)}")
-    parser.add_argument("--source", help="images of a camera: a folder or a video")
+    parser.add_argument("--profiles", help="instead: profiles of Compose, of which one is the world, and the others "
+                                           "may be guide and ros")
+    parser.add_argument("--source", help="images of a camera: a folder, a video, a webcam or a topic of ROS 2")
     parser.add_argument("--poses", help="poses of that camera: JSON lines or TUM")
     parser.add_argument("--intrinsics", metavar="fx,fy,cx,cy", help="intrinsics of its images, in pixels")
+    parser.add_argument("--board", help="description of a printed board that tells its poses")
+    parser.add_argument("--calibration", help="calibration of its lens")
+    parser.add_argument("--goal", help="image of the view to find; without it a camera's agent explores")
+    parser.add_argument("--ros-router", help="address of the router of ROS 2")
+    parser.add_argument("--guide-port", type=int, help="port of the page that guides a hand")
     parser.add_argument("--view-port", type=int, help="port of the viewer's page, open to other hosts")
     parser.add_argument("--view-data-port", type=int, default=9876, help="port of the viewer's data")
     parser.add_argument("--view-published", metavar="ADDRESS",
                         help="address of the machine on which a container publishes these ports")
     parser.add_argument("--set", default="", metavar="'KEY=VALUE ...'", help="configuration by dotted keys")
-    told = parser.parse_args(argv)
+    return parser
+
+
+def _given(told: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    """The configuration that the command line asks for, by dotted keys, and its world."""
+    profiles = (told.profiles or told.world).split(",")
+    world = next((name for name in profiles if name in WORLDS), profiles[0])
+    source = told.source or None
+    given = {"bus.endpoint": told.endpoint, "bus.listen": told.listen, "scene.objects": told.objects,
+             "perception.weights": weights_folder(told.weights), "seed": told.seed, "scene.count": told.count,
+             "camera.source": source, "camera.poses": told.poses or None,
+             "camera.intrinsics_px": numbers(told.intrinsics or None), "camera.board": told.board or None,
+             "camera.calibration": told.calibration or None, "scene.goal_image": told.goal or None}
+    if told.ros_router and ("ros" in profiles or (source or "").startswith(ROS_PREFIX)):
+        given |= {"ros.router": told.ros_router, "ros.publish": "ros" in profiles}
+    if world_of(world).live:  # a real camera has no scenes to draw, and waits for nobody
+        given |= {"scene.count": None, "scene.explore": not told.goal, "bus.live": True,
+                  "planner.moved_by": "hand" if source and is_live(source) else None}
+    if told.view_port:
+        given |= {"viewer.address": "0.0.0.0", "viewer.port": told.view_port,
+                  "viewer.data_port": told.view_data_port, "viewer.published": told.view_published}
+    if told.guide_port and "guide" in profiles:
+        given |= {"viewer.guide_port": told.guide_port}
+    return given, world
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Directs one run. If the run cannot be prepared or does not come to its end, it prints one line and ends with exit
+    code 2."""
+    told = _parser().parse_args(argv)
     signal.signal(signal.SIGTERM, lambda *_: os._exit(0))  # its threads wait for messages, and nothing is left to save
     try:
-        given = {"bus.endpoint": told.endpoint, "bus.listen": told.listen, "scene.objects": told.objects,
-                 "perception.weights": weights_folder(told.weights), "seed": told.seed, "scene.count": told.count,
-                 "camera.source": told.source or None, "camera.poses": told.poses or None,
-                 "camera.intrinsics_px": numbers(told.intrinsics or None)}
-        if world_of(told.world).live:  # a real camera has no scenes to draw, and waits for nobody
-            given |= {"scene.count": None, "scene.explore": True, "bus.live": True}
-        if told.view_port:
-            given |= {"viewer.address": "0.0.0.0", "viewer.port": told.view_port,
-                      "viewer.data_port": told.view_data_port, "viewer.published": told.view_published}
+        given, world = _given(told)
         config, agent = configured(None, given, shlex.split(told.set), told.agent or None)
         config = config.with_values({"viewer.token": with_token(config.viewer).token})
-        direct(config, agent, told.world, told.worlds, runs_folder(), Console(width=200))
+        if told.profiles and "guide" in told.profiles.split(","):
+            print(f"where to go next: {guide_url_of(config.viewer)}", flush=True)
+        direct(config, agent, world, told.worlds, runs_folder(), Console(width=200))
     except SaccadeError as error:
         print(f"saccade: {error}", file=sys.stderr)
         sys.exit(EXIT_ERROR)

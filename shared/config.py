@@ -165,6 +165,8 @@ class CameraConfig(Section):
     """fx, fy, cx, cy of the source's images, in pixels."""
     board: Path | None = None
     """Description of a printed board on the table, which tells the camera's poses. `saccade board` writes it."""
+    more_boards: tuple[Path, ...] = Field((), max_length=15)
+    """Descriptions of further boards. Where they lie is learnt from images that show them together."""
     calibration: str | None = None
     """File that `saccade calibrate` wrote, or the name of a camera under which it is kept. It tells the intrinsics and
     the distortion of the lens, which is removed."""

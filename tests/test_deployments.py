@@ -12,7 +12,9 @@ import pytest
 import yaml
 
 from saccade.app.run.registry import agent_processes
-from saccade.shared.config import PACKAGE, set_folder
+from saccade.app.run.supervisor import GUIDE, ROS
+from saccade.deploy.director import main as direct
+from saccade.shared.config import PACKAGE, Config, set_folder
 
 PROCESSES = {process.name: process.module for process in agent_processes("sceneccn", view=True)}
 BESIDE = {"director"}  # in the launcher's place
@@ -56,6 +58,63 @@ def test_all_start_the_same_processes(compose, kubernetes):
     for name in (*PROCESSES, *BESIDE):
         assert in_compose[name]["image"] == in_kubernetes[name]["image"].removesuffix(":latest") == f"saccade/{name}"
         assert bytes_of(in_compose[name]["mem_limit"]) == bytes_of(in_kubernetes[name]["resources"]["limits"]["memory"])
+
+
+def test_the_pages_and_bridges_that_are_asked_for_have_an_image_too(compose):
+    """They are profiles of Compose: `docker compose up` alone starts none of them."""
+    dockerfile = (PACKAGE / "deploy" / "Dockerfile").read_text()
+    stages = {stage.split()[2]: stage for stage in dockerfile.split("\nFROM ")[1:]}
+    for process in (GUIDE, ROS):
+        name = process.name
+        assert (compose[name]["profiles"], compose[name]["image"]) == ([name], f"saccade/{name}")
+        assert compose[name]["build"]["target"] == name
+        assert f'CMD ["{name}"]' in stages[name]
+        assert f"COPY services/{name} services/{name}" in stages[name]
+    port, = compose["guide"]["ports"]
+    assert port == "127.0.0.1:${SACCADE_GUIDE_PORT:-9092}:${SACCADE_GUIDE_PORT:-9092}"
+
+
+def told_by_compose(compose, monkeypatch, **variables) -> Config:
+    """The configuration of a run that Compose starts with these variables."""
+    given = {name: str(value) for name, value in variables.items()}
+
+    def filled(text: str) -> str:
+        for _ in range(2):  # one variable may stand in another's
+            text = re.sub(r"\$\{(\w+):\+([^{}]*)\}", lambda m: m[2] if given.get(m[1]) else "", text)
+            text = re.sub(r"\$\{(\w+):-([^{}]*)\}", lambda m: given.get(m[1]) or m[2], text)
+        return text
+
+    directed = []
+    monkeypatch.setattr("saccade.deploy.director.direct", lambda config, agent, world, *_: directed.append(
+        (config, world)))
+    direct([filled(argument) for argument in compose["director"]["command"]])
+    (config, world), = directed
+    assert world == ("camera" if "camera" in given.get("COMPOSE_PROFILES", "") else "simulator")
+    return config
+
+
+def test_a_webcam_a_board_and_a_goal_are_wired_through_to_the_run(compose, monkeypatch, capsys):
+    config = told_by_compose(compose, monkeypatch, COMPOSE_PROFILES="camera,guide", SACCADE_WEBCAM="/dev/video2",
+                             SACCADE_BOARD="my_board.json", SACCADE_CALIBRATION="my.toml", SACCADE_GOAL="photo.jpg",
+                             SACCADE_GUIDE_PORT=9099)
+    camera, mounted = config.camera, {volume["target"] for volume in compose["camera"]["volumes"]
+                                      if isinstance(volume, dict)}
+    assert (camera.source, config.planner.moved_by, config.scene.explore) == ("webcam:0", "hand", False)
+    assert {str(camera.board), camera.calibration, str(config.scene.goal_image)} <= mounted
+    assert compose["camera"]["devices"] == ["${SACCADE_WEBCAM:-/dev/null}:/dev/video0"]
+    assert config.viewer.guide_port == 9099
+    assert "where to go next: http://localhost:9099" in capsys.readouterr().out
+    assert not config.ros.publish
+
+
+def test_nodes_of_ros_are_wired_through_to_the_run(compose, monkeypatch):
+    config = told_by_compose(compose, monkeypatch, COMPOSE_PROFILES="camera,ros", SACCADE_ROS_TOPIC="/camera/image")
+    assert (config.camera.source, config.ros.publish, config.scene.explore) == ("ros:/camera/image", True, True)
+    for name in ("camera", "ros"):
+        assert compose[name]["extra_hosts"] == ["host.docker.internal:host-gateway"]
+    assert config.ros.router == "tcp/host.docker.internal:7447"
+    plain = told_by_compose(compose, monkeypatch)
+    assert (plain.camera, plain.ros, plain.scene.goal_image) == (Config().camera, Config().ros, None)
 
 
 def test_whoever_reads_objects_or_what_is_learnt_of_them_has_the_users_own_sets(compose):

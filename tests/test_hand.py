@@ -7,6 +7,7 @@ import pytest
 
 from saccade.app.run.run import in_world
 from saccade.services.planner.core import build
+from saccade.services.planner.declaring import Evidence
 from saccade.services.planner.hand import ELSEWHERE_M, LOOKS, MOST_LOOKS, MOVED_M, PATIENCE, SHIFTED_M, Hand
 from saccade.shared.bus.messages import Belief, Percept
 from saccade.shared.config import Config
@@ -30,8 +31,8 @@ def followed(spheres=FREE) -> Hand:
     return hand
 
 
-def verdicts(hand, poses, goal_here=0.9, eye=EYE) -> list[str]:
-    return [hand.take(camera, goal_here, eye) for camera in poses]
+def verdicts(hand, poses, look=0.9, eye=EYE, fused=0.9, rival=False) -> list[str]:
+    return [hand.take(camera, look and Evidence(look, fused, rival), eye) for camera in poses]
 
 
 def test_the_plan_waits_for_the_hand():
@@ -45,23 +46,28 @@ def test_a_hand_that_goes_elsewhere_gets_another_plan():
         "stay", "stay", "stay", "renew"]
 
 
-@pytest.mark.parametrize(("goal_here", "verdict"), [(0.9, "there"), (0.1, "wrong")])
-def test_several_looks_decide_whether_it_is_the_goal(goal_here, verdict):
+@pytest.mark.parametrize(("look", "fused", "rival", "verdict"), [
+    (0.9, 0.9, False, "there"), (0.45, 0.9, False, "there"), (0.7, 0.02, False, "wrong"), (0.1, 0.5, False, "wrong"),
+    (0.8, 0.9, True, "rival"), (0.95, 0.9, True, "there"), (0.1, 0.1, True, "wrong")])
+def test_several_looks_and_all_views_together_decide_whether_it_is_the_goal(look, fused, rival, verdict):
+    """The looks alone are not enough against all views; where a rival is left, only clear looks are."""
     hand = followed()
-    assert verdicts(hand, [at(0.2)] + [at(NEAR_M / 2)] * LOOKS, goal_here) == ["stay"] * LOOKS + [verdict]
+    told = verdicts(hand, [at(0.2)] + [at(NEAR_M / 2)] * LOOKS, look, fused=fused, rival=rival)
+    assert told == ["stay"] * LOOKS + [verdict]
 
 
 def test_one_look_does_not_decide_against_the_others():
     hand = followed()
-    looks = [hand.take(at(0), here, EYE) for here in (0.9, 0.9, 0.1, 0.9, 0.9)]
+    looks = [hand.take(at(0), Evidence(look, 0.9), EYE) for look in (0.9, 0.9, 0.1, 0.9, 0.9)]
     assert looks[-1] == "there"
 
 
 def test_where_looks_leave_a_doubt_there_are_more_of_them():
-    assert verdicts(followed(), [at(0)] * MOST_LOOKS, goal_here=0.4) == ["stay"] * (MOST_LOOKS - 1) + ["wrong"]
+    doubt = {"look": 0.4, "fused": 0.6}
+    assert verdicts(followed(), [at(0)] * MOST_LOOKS, **doubt) == ["stay"] * (MOST_LOOKS - 1) + ["wrong"]
     hand = followed()
-    assert set(verdicts(hand, [at(0)] * LOOKS, goal_here=0.4)) == {"stay"}
-    assert "there" in verdicts(hand, [at(0)] * LOOKS, goal_here=0.9)
+    assert set(verdicts(hand, [at(0)] * LOOKS, **doubt)) == {"stay"}
+    assert "there" in verdicts(hand, [at(0)] * LOOKS, look=0.95, fused=0.6)
 
 
 def test_before_it_decides_the_hand_is_led_to_where_the_goal_is_believed_now():
@@ -75,13 +81,13 @@ def test_a_hand_that_cannot_come_nearer_is_asked_no_more():
 
 
 def test_to_search_the_tolerance_of_the_task_is_enough():
-    assert verdicts(followed(), [at(0.2), at(0.06)], goal_here=None) == ["stay", "renew"]
+    assert verdicts(followed(), [at(0.2), at(0.06)], look=None) == ["stay", "renew"]
 
 
 def test_once_there_it_stays_there():
     hand = followed()
     verdicts(hand, [at(0)] * LOOKS)
-    assert verdicts(hand, [at(0.05), at(0.5), at(0.0)], goal_here=0.0) == ["there", "stay", "there"]
+    assert verdicts(hand, [at(0.05), at(0.5), at(0.0)], look=0.01) == ["there", "stay", "there"]
 
 
 def test_a_goal_that_is_believed_elsewhere_renews_an_old_plan_only():

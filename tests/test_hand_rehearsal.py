@@ -13,9 +13,10 @@ from saccade.benchmarks.hand import (
     SWAY_RAD,
     Hand,
     Sway,
-    as_measured,
+    rehearsed,
     summary,
 )
+from saccade.benchmarks.hand_eyes import as_measured
 from saccade.shared.world.geometry import INTRINSICS_PX, look_at, rotation_angle
 from saccade.shared.world.guidance import guide
 from saccade.shared.world.task import Spheres, spheres_around, start_pose
@@ -77,3 +78,11 @@ def test_the_summary_counts_of_what():
     assert [(told[key]["count"], told[key]["of"]) for key in (
         "reached", "declared", "declared_rightly_of_the_declared", "declared_rightly_of_all")] == [
         (2, 3), (2, 3), (1, 2), (1, 3)]
+
+
+def test_rehearsals_go_on_where_they_were_interrupted_and_others_are_not_counted(tmp_path):
+    file = tmp_path / "hand.json"
+    assert rehearsed(file, seed=1, board=False) == {}
+    file.write_text('{"seed": 1, "rehearsals": [{"scene": "a"}]}')
+    assert rehearsed(file, seed=1, board=False) == {"a": {"scene": "a"}}
+    assert rehearsed(file, seed=2, board=False) == rehearsed(file, seed=1, board=True) == {}

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path as Outline
 
-from saccade.services.camera.charuco import LEAST_SQUARES, Board, black_boxes_m
+from saccade.services.camera.charuco import LEAST_SQUARES, Board, Dictionary, black_boxes_m
 from saccade.shared.errors import SaccadeError
 from saccade.shared.files import replace_all, writing
 from saccade.shared.world.geometry import Array
@@ -38,12 +38,14 @@ class Paper:
     ruler_m: float
 
 
+DICTIONARIES: dict[Dictionary, int] = {"4X4_100": 100, "4X4_250": 250, "4X4_1000": 1000}  # how many markers each has
 PAPERS = {"a4": Paper(0.210, 0.297, 0.025, 0.15), "a3": Paper(0.297, 0.420, 0.035, 0.25),
           "letter": Paper(0.2159, 0.2794, 0.025, 0.15)}
 
 
-def board_for(paper: Paper, square_m: float | None, *, free_middle: bool) -> Board:
-    """Returns the board with the most squares that fit on the paper. Raises SaccadeError if too few or too many fit."""
+def board_for(paper: Paper, square_m: float | None, *, free_middle: bool, number: int = 1) -> Board:
+    """Returns the board with the most squares that fit on the paper. Sheets of the same size with another `number`
+    share no marker. Raises SaccadeError if too few or too many squares fit."""
     side = square_m or paper.square_m
     columns, rows = (math.floor((length + 1e-9) / side) for length in
                      (paper.width_m - 2 * MARGIN_M, paper.height_m - 2 * MARGIN_M - FOOT_M))
@@ -51,12 +53,17 @@ def board_for(paper: Paper, square_m: float | None, *, free_middle: bool) -> Boa
     if min(columns, rows) < least:
         raise SaccadeError(f"--square-mm {1e3 * side:g}: {columns}x{rows} squares would fit, and {least}x{least} are "
                            "needed: give smaller squares or larger paper")
+    markers = columns * rows // 2
+    dictionary: Dictionary = "4X4_250"  # a board with more markers is refused
+    if markers <= DICTIONARIES[dictionary]:
+        dictionary = next((name for name, most in DICTIONARIES.items() if markers * number <= most), "4X4_1000")
     try:
         return Board(squares=(columns, rows), square_m=side, marker_m=round(MARKER_SHARE * side, 4),
-                     dictionary="4X4_100" if columns * rows <= 200 else "4X4_250", free_middle=free_middle)
+                     dictionary=dictionary, first_marker=markers * (number - 1), free_middle=free_middle)
     except ValueError as error:
-        raise SaccadeError(f"--square-mm {1e3 * side:g}: {columns}x{rows} squares are more than a board has: give "
-                           "larger squares") from error
+        many = f"--square-mm {1e3 * side:g}: {columns}x{rows} squares are more than a board has"
+        raise SaccadeError(f"{many if number == 1 else f'{many} with --number {number}'}: give larger squares"
+                           ) from error
 
 
 def as_printed(board: Board, paper: Paper, measured_m: float | None) -> Board:

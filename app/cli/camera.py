@@ -18,13 +18,15 @@ def board(*, out: Annotated[Path, typer.Option(help="The sheet; its description 
               help="Squares everywhere, for objects beside the sheet, or a free middle where objects stand.")] = "full",
           square_mm: Annotated[float | None, typer.Option(
               min=5, max=200, help="Side of a square in millimetres.", show_default="25; 35 on A3")] = None,
+          number: Annotated[int, typer.Option(
+              min=1, max=16, help="Number of the sheet, if several are used together.")] = 1,
           measured_mm: Annotated[float | None, typer.Option(
               min=1, help="Length of the ruler on your print, if it is not what it says.")] = None) -> None:
     """Make a board to print: it tells Saccade where the camera is, and calibrates it."""
     from saccade.app.camera.sheet import PAPERS, as_printed, board_for, write_sheet
 
     paper = PAPERS[size]
-    made = board_for(paper, square_mm and square_mm / 1e3, free_middle=middle == "free")
+    made = board_for(paper, square_mm and square_mm / 1e3, free_middle=middle == "free", number=number)
     measured_m = measured_mm and measured_mm / 1e3
     printed = as_printed(made, paper, measured_m)
     told = write_sheet(out, made, paper, measured_m)

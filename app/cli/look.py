@@ -100,7 +100,10 @@ def see(photos: Annotated[list[Path], typer.Argument(metavar="PHOTO...", help="P
         json_file: Annotated[Path | None, typer.Option(
             "--json", help="Write what is seen, with masks, as JSON.", metavar="FILE")] = None,
         out: Annotated[Path | None, typer.Option(
-            help="Save a picture with outlines and names for each photograph.", metavar="FOLDER")] = None) -> None:
+            help="Save a picture with outlines and names for each photograph.", metavar="FOLDER")] = None,
+        map_file: Annotated[Path | None, typer.Option(
+            "--map", help="Write a map of the objects and cameras, by the objects that photographs have in common.",
+            metavar="FILE")] = None) -> None:
     """Say which objects are in photographs, where, how far, how sure, and how they are turned."""
     from rich.console import Console
 
@@ -115,7 +118,8 @@ def see(photos: Annotated[list[Path], typer.Argument(metavar="PHOTO...", help="P
         agent = AGENT_OF_PHOTOGRAPHS
     config, agent = configured(None, {"scene.objects": objects, "scene.names": split_names(names),
                                       "perception.weights": weights}, None, agent)
-    if look_at(photos, config, agent=agent, intrinsics_px=given, json_file=json_file, out=out, console=wide(Console())):
+    if look_at(photos, config, agent=agent, intrinsics_px=given, json_file=json_file, out=out, console=wide(Console()),
+               map_file=map_file):
         raise typer.Exit(2)  # each one was said
 
 

@@ -57,8 +57,9 @@ def run(*, objects: Objects = None, names: Names = None, scenes: ScenesFile = No
             help="File or folder with the camera's poses, such as TUM, transforms.json or COLMAP.")] = None,
         intrinsics: Annotated[str | None, typer.Option(
             help="Intrinsics of the camera's images, in pixels.", metavar="fx,fy,cx,cy")] = None,
-        board: Annotated[Path | None, typer.Option(
-            help="Description of a printed board on the table, which tells the camera's poses (`saccade board`).",
+        board: Annotated[list[Path] | None, typer.Option(
+            help="Description of a printed board on the table, which tells the camera's poses (`saccade board`). Can "
+                 "be given several times; the first board is the origin.",
             metavar="BOARD.json")] = None,
         calibration: Annotated[str | None, typer.Option(
             help="Calibration of the camera (`saccade calibrate`): a file, or the name of a camera.",
@@ -95,7 +96,9 @@ def run(*, objects: Objects = None, names: Names = None, scenes: ScenesFile = No
              "scene.goal_image": goal,
              "scene.goal_intrinsics_px": numbers(goal_intrinsics, "--goal-intrinsics"),
              "scene.explore": explore or None, "bus.kind": bus,
-             "perception.weights": weights, "camera.source": source, "camera.poses": poses, "camera.board": board,
+             "perception.weights": weights, "camera.source": source, "camera.poses": poses,
+             "camera.board": board[0] if board else None,
+             "camera.more_boards": [str(path) for path in board[1:]] if board and len(board) > 1 else None,
              "camera.calibration": calibration,
              "camera.intrinsics_px": numbers(intrinsics), "camera.rate_hz": rate, "camera.loop": loop or None,
              "camera.image_topic": image_topic, "camera.camera_frame": camera_frame,

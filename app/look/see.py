@@ -17,6 +17,7 @@ from rich.table import Table
 from rich.text import Text
 
 from saccade.app.look.fitting import LONGEST_PX, Fitted, fitted
+from saccade.app.look.relative_map import map_of, places_in
 from saccade.app.look.see_picture import draw_look
 from saccade.app.look.sights import Look, Sight
 from saccade.app.run.registry import AGENTS, agent_of
@@ -113,16 +114,18 @@ def drawing_of(artist: LatentDecoder | BankPictures | None, latent: NDArray[np.f
 
 
 def see(paths: Sequence[Path], config: Config, *, agent: str, intrinsics_px: Sequence[float] | None,
-        json_file: Path | None, out: Path | None, console: Console) -> int:
+        json_file: Path | None, out: Path | None, console: Console, map_file: Path | None = None) -> int:
     """Looks at photographs and prints what is in each. Returns how many of them could not be read; each of these is one
     line on stderr.
 
-    `json_file` gets the entries of all photographs, and the folder `out` a picture for each. Raises SaccadeError if the
+    `json_file` gets the entries of all photographs, the folder `out` a picture for each, and `map_file` a map of the
+    objects that they show together (see `relative_map.py`). Raises SaccadeError if the
     networks, the file or the folder cannot be used.
     """
-    _require_places(paths, json_file, out)
+    _require_places(paths, json_file, out, map_file)
     looker = Looker(config, agent, draw=out is not None)
     entries: list[dict[str, Any]] = []
+    looks: list[Look] = []
     taken = {os.path.realpath(path) for path in paths}
     failed = 0
     for path in paths:
@@ -134,6 +137,8 @@ def see(paths: Sequence[Path], config: Config, *, agent: str, intrinsics_px: Seq
             continue
         look = looker.look(photo)
         tell(look, console)
+        if map_file is not None:
+            looks.append(look)
         if json_file is not None:
             entries += look.entries()
         if out is not None:
@@ -141,10 +146,28 @@ def see(paths: Sequence[Path], config: Config, *, agent: str, intrinsics_px: Seq
             draw_look(look, target)
             _say(console, f"written to {target}")
     if json_file is not None:
-        with writing(json_file, "results"):
-            replace_whole(json_file, (json.dumps(entries, separators=(",", ":")) + "\n").encode())
-        _say(console, f"written to {json_file}")
+        _write(json_file, entries, "results", console)
+    if map_file is not None:
+        _map(looks, map_file, console)
     return failed
+
+
+def _map(looks: Sequence[Look], file: Path, console: Console) -> None:
+    """Prints and writes the map of what photographs show together."""
+    found, names = map_of([places_in(look) for look in looks]), [str(look.photo.path) for look in looks]
+    for name, place in sorted(found.places.items()):
+        right, up, back = place
+        _say(console, f"{name}: {right:.2f} m to the right, {up:.2f} up, {-back:.2f} ahead of the first camera")
+    for k, why in found.why_not.items():
+        _say(console, f"{names[k]} is not in the map: {why}")
+    _say(console, found.worth(len(looks)))
+    _write(file, found.entry(names), "map", console)
+
+
+def _write(path: Path, content: Any, what: str, console: Console) -> None:
+    with writing(path, what):
+        replace_whole(path, (json.dumps(content, separators=(",", ":")) + "\n").encode())
+    _say(console, f"written to {path}")
 
 
 def tell(look: Look, console: Console) -> None:
@@ -170,16 +193,18 @@ def _say(console: Console, text: str) -> None:
     console.print(Text(printable(text, LINE_LIMIT)), soft_wrap=True)
 
 
-def _require_places(paths: Sequence[Path], json_file: Path | None, out: Path | None) -> None:
+def _require_places(paths: Sequence[Path], json_file: Path | None, out: Path | None, map_file: Path | None) -> None:
     """Checks before anything is computed that results can be written, and that no photograph is written over."""
     if out is not None:
         with writing(out, "folder of pictures"):
             out.mkdir(parents=True, exist_ok=True)
-    if json_file is not None:
-        if os.path.realpath(json_file) in {os.path.realpath(path) for path in paths}:
-            raise SaccadeError(f"--json {json_file} is one of the photographs: name another file")
-        if json_file.is_dir() or not json_file.parent.is_dir():
-            raise SaccadeError(f"--json {json_file} cannot be written: name a file in a folder that is there")
+    for option, file in (("--json", json_file), ("--map", map_file)):
+        if file is None:
+            continue
+        if os.path.realpath(file) in {os.path.realpath(path) for path in paths}:
+            raise SaccadeError(f"{option} {file} is one of the photographs: name another file")
+        if file.is_dir() or not file.parent.is_dir():
+            raise SaccadeError(f"{option} {file} cannot be written: name a file in a folder that is there")
 
 
 def _name_in(folder: Path, path: Path, taken: set[str]) -> Path:

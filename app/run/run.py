@@ -151,10 +151,12 @@ def resolve(config: Config) -> Config:
     paths = {"scene.file": scene.file, "scene.goal_image": scene.goal_image,
              "camera.poses": config.camera.poses, "camera.board": config.camera.board,
              "perception.weights": config.perception.weights}
+    more = {"camera.more_boards": [str(path.resolve()) for path in config.camera.more_boards]} \
+        if config.camera.more_boards else {}
     source = {} if config.camera.source is None else {"camera.source": absolute(config.camera.source)}
     if config.camera.calibration is not None:
         paths["camera.calibration"] = calibration_path(config.camera.calibration)
-    return config.with_values({"scene.names": list(names_in_use(scene))} | source |
+    return config.with_values({"scene.names": list(names_in_use(scene))} | source | more |
                               {key: path.resolve() for key, path in paths.items() if path is not None})
 
 

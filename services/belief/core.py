@@ -83,7 +83,8 @@ class BeliefFilter:
         """How views of an object are compared with its percept in the goal image. Empty if they cannot be."""
         if goal.rotations is not None:
             return [TurnLikeness(goal, self.symmetry[goal.object])]
-        return [LatentLikeness(self.transitions[goal.object], goal)] if len(goal.latent_mean) else []
+        direct = self.config.belief.pose != "last"  # the paper's agent has the transition alone
+        return [LatentLikeness(self.transitions[goal.object], goal, direct=direct)] if len(goal.latent_mean) else []
 
     def _update(self, name: str, percepts: dict[str, Percept], present: set[str]) -> Belief:
         percept, position = percepts[name], self.positions[name]

@@ -2,7 +2,8 @@
 
 The directions are the cells of a grid on the hemisphere above the object. For each view, the CCN's transition moves the
 latent pose of the view to every cell. A cell is as likely as the goal's latent pose is under the moved one (paper,
-equations 2 and 5). The likelihoods of views from different places are multiplied. For a nearly symmetric object the
+equations 2 and 5). A view from about the same direction is also compared with the goal's directly, which tells apart
+sides that look alike. The likelihoods of views from different places are multiplied. For a nearly symmetric object the
 posterior may have several modes; new views decide between them. Percepts that tell rotations in place of a latent pose
 are fused over the turn of the object (`services/belief/turn.py`).
 """
@@ -19,6 +20,7 @@ from saccade.services.belief.turn import GoalDirections, turn_probability
 from saccade.shared.bus.messages import Percept
 from saccade.shared.config import BeliefConfig
 from saccade.shared.model.latent import LatentTransition, log_density
+from saccade.shared.world.directions import alike
 from saccade.shared.world.geometry import (
     GRID_AZIMUTHS,
     GRID_ELEVATIONS,
@@ -34,11 +36,16 @@ from saccade.shared.world.symmetry import NONE, turns_of
 Array = NDArray[np.float64]
 
 OUTLIER = 0.05  # chosen: probability that the latent pose of a view says nothing about the goal's direction
+SAME_RAD = 0.5  # chosen: two views within about this angle are compared directly, too
+# Measured between views within 0.35 rad: deviation of a latent pose moved by the change of the transition, for views
+# from the same direction (with half a cell of the grid) and for each radian between them.
+SAME_STD, SAME_STD_PER_RAD = 0.065, 0.25
+DIRECT = 0.97  # chosen: probability that the direct comparison of two views from the same direction holds
+USUAL = 1.5  # chosen: variance, in units of those, up to which a view looks like the goal
+LEAST_SHARE = 1e-3  # chosen: where the direct comparison counts less than this it is left out
 NEW_VIEW_RAD = 0.08  # chosen: two views within this angle count as the same view; a little less than a cell of the grid
 BETTER = 1.2  # chosen: a view replaces the same kept view if its quality is higher by this factor
 CERTAIN = 0.03  # chosen: the quality of a view is its presence / (this + standard deviation of its log scale)
-HERE_RAD = 0.25  # chosen: directions within this angle count as the same direction; half of the task's tolerance
-TURNED_RAD = 0.5  # derived: the task's tolerance for the rotation of the image, which the azimuth changes near the pole
 NEAR_RAD = 0.35  # chosen: views within about this angle of the goal's likeliest direction count more
 NEAR_WEIGHT = 5.0  # chosen: what is added at most to the weight 1 of a view near the goal's likeliest direction
 SAME_SCALE = 0.3  # chosen: weight of the prior that the goal's range is as measured; one near view has at most 1
@@ -57,10 +64,17 @@ class Likeness(Protocol):
 
 class LatentLikeness:
     """The likeness by latent poses, directly over the directions of the grid. `goal` is the object's percept in the
-    goal image."""
+    goal image.
 
-    def __init__(self, transition: LatentTransition, goal: Percept):
-        self.transition = transition
+    The deviation of the transition does not become small where it hardly moves, and opposite sides of a can that look
+    nearly alike are within it. So with `direct` a direction near that of the view is less likely if the view does not
+    look like the goal. For this, its latent pose is moved by no more than the transition changes on the way, with a
+    deviation that grows with the way. That a view looks like the goal says nothing against other directions: the object
+    may be symmetric.
+    """
+
+    def __init__(self, transition: LatentTransition, goal: Percept, *, direct: bool = True):
+        self.transition, self.direct = transition, direct
         self.goal_mean, self.goal_std = np.array(goal.latent_mean), np.array(goal.latent_std)
         elevation, azimuth = viewing_grid()
         self.elevation, self.azimuth = (x.ravel() for x in np.meshgrid(elevation, azimuth, indexing="ij"))
@@ -72,9 +86,25 @@ class LatentLikeness:
         displacement = np.stack([wrap(self.azimuth - azimuth), self.elevation - elevation], axis=-1)
         moved_mean, moved_std = self.transition(percept.latent_mean, displacement)
         score = log_density(self.goal_mean, moved_mean, np.sqrt(moved_std ** 2 + self.goal_std ** 2)).astype(np.float64)
+        if self.direct:
+            score = self._compared(score, percept, displacement, moved_mean.astype(np.float64))
         share = np.exp(score - score.max())
         share = (1 - OUTLIER) * share / share.sum() + OUTLIER / len(share)
         return np.log(share).reshape(GRID_ELEVATIONS, GRID_AZIMUTHS)
+
+    def _compared(self, score: Array, percept: Percept, displacement: Array, moved_mean: Array) -> Array:
+        """The log densities of the directions [N], less where they are near and the view is unlike the goal."""
+        way = np.hypot(*displacement.T)  # near the pole, too, a change of azimuth rotates the image
+        share = DIRECT * np.exp(-0.5 * (way / SAME_RAD) ** 2)
+        near = share > LEAST_SHARE
+        start, _ = self.transition(percept.latent_mean, np.zeros((1, 2)))
+        moved = percept.latent_mean + moved_mean[near] - start
+        std = np.hypot(SAME_STD, SAME_STD_PER_RAD * way[near])
+        excess = ((self.goal_mean - moved) ** 2).mean(1) / std ** 2 - USUAL
+        unlike = np.exp(-0.5 * len(self.goal_mean) * np.maximum(excess, 0.0))
+        compared = score.copy()
+        compared[near] += np.log1p(share[near] * (unlike - 1.0))
+        return compared
 
     def grid(self, log_probability: Array) -> Array:
         """The same, because it is over the grid already."""
@@ -119,7 +149,8 @@ class GoalView:
     """
 
     def __init__(self, config: BeliefConfig, likeness: Likeness, goal: Percept, symmetry: int = NONE):
-        self.config, self.likeness, self.equal_rad = config, likeness, turns_of(symmetry, GRID_AZIMUTHS)
+        self.config, self.likeness, self.symmetry = config, likeness, symmetry
+        self.equal_rad = turns_of(symmetry, GRID_AZIMUTHS)
         self.measured_range_m = REFERENCE_RANGE_M / goal.scale
         elevation, azimuth = viewing_grid()
         self.elevation, self.azimuth = (x.ravel() for x in np.meshgrid(elevation, azimuth, indexing="ij"))
@@ -154,20 +185,7 @@ class GoalView:
         last = self.keyframes[-1]
         alone = last.log_likelihood if last.percept is percept else self.likeness.of(percept, self.center)
         share = np.exp(self.likeness.grid(alone)).ravel()
-        alike = np.any([self._near(eye, equal) for equal in self.equal_rad], axis=0)
-        return float(share[alike].sum())
-
-    def _near(self, eye: Array, equal_rad: float) -> NDArray[np.bool_]:
-        """Which directions of the grid count as that of `eye` [3], turned by an angle after which the object looks the
-        same."""
-        azimuth, elevation, _ = spherical(eye, self.center)
-        towards = unit(eye - self.center) if equal_rad == 0.0 else direction(azimuth + equal_rad, elevation)
-        near = direction(self.azimuth, self.elevation) @ towards > np.cos(HERE_RAD)
-        # Near the pole a change of azimuth rotates the image. Only directions with about the present rotation count.
-        aside = np.abs(wrap(self.azimuth - azimuth - equal_rad))
-        turned = aside < HERE_RAD / max(float(np.cos(elevation)), HERE_RAD)
-        upright = (elevation < np.pi / 2 - 3 * HERE_RAD) | (aside < TURNED_RAD)
-        return near & turned & upright
+        return float(share[alike(eye, self.center, self.symmetry).ravel()].sum())
 
     def log_posterior(self) -> Array | None:
         """Log probabilities of the directions of the grid, normalised [E, A]. None before the first view.

@@ -142,7 +142,13 @@ def _judged(found: list[Measured], largest_rms_px: float, count: int) -> Measure
         variance = max(LEAST_SIGMA_PX, best.rms_px / np.sqrt(2)) ** 2
         if count * (other[0].rms_px ** 2 - best.rms_px ** 2) / variance < CLEARLY_BETTER:
             return Doubtful("the board may be tilted either way: go nearer, or look at it from the side")
-    sigma_m, sigma_rad = (float(np.sqrt(np.linalg.eigvalsh(best.covariance[k:k + 3, k:k + 3]).max())) for k in (0, 3))
+    return certain(best)
+
+
+def certain(measured: Measured) -> Measured | Doubtful:
+    """The same pose, or that its covariance is too large."""
+    sigma_m, sigma_rad = (float(np.sqrt(np.linalg.eigvalsh(measured.covariance[k:k + 3, k:k + 3]).max()))
+                          for k in (0, 3))
     if sigma_m > MAX_SIGMA_M or sigma_rad > MAX_SIGMA_RAD:
         return Doubtful("the board is seen too small, or too little of it: go nearer, or look at it from higher up")
-    return best
+    return measured

@@ -5,6 +5,7 @@ The board's frame is the table's: metres, z up, the origin at the board's middle
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -44,6 +45,8 @@ class Board(Section):
     """Side of a marker, with its black edge."""
     dictionary: Dictionary = "4X4_100"
     """OpenCV's dictionary of the markers, without DICT_."""
+    first_marker: int = Field(0, ge=0, lt=1000)
+    """Number of the first marker. Boards that are used together share no marker."""
     free_middle: bool = False
     """Whether the middle is left white, so that objects can stand there."""
     legacy_pattern: bool = False
@@ -54,13 +57,19 @@ class Board(Section):
         if not 0.4 * self.square_m <= self.marker_m <= 0.95 * self.square_m:
             raise ValueError(f"marker_m {self.marker_m:g} is not between 40% and 95% of square_m {self.square_m:g}")
         columns, rows = self.squares
-        markers, known = columns * rows // 2, int(self.dictionary.split("_")[1])
-        if markers > known:
-            raise ValueError(f"{columns}x{rows} squares need {markers} markers, the dictionary {self.dictionary} has "
-                             f"{known}")
+        known = int(self.dictionary.split("_")[1])
+        if self.markers.stop > known:
+            first = f" from {self.first_marker} on" if self.first_marker else ""
+            raise ValueError(f"{columns}x{rows} squares need {len(self.markers)} markers{first}, the dictionary "
+                             f"{self.dictionary} has {known}")
         if self.free_middle and min(self.squares) < 2 * RING + 1:
             raise ValueError(f"{columns}x{rows} squares have no room for a free middle")
         return self
+
+    @property
+    def markers(self) -> range:
+        """The numbers of its markers."""
+        return range(self.first_marker, self.first_marker + self.squares[0] * self.squares[1] // 2)
 
     @property
     def size_m(self) -> Array:
@@ -100,6 +109,19 @@ def read_board(path: Path) -> Board:
     return checked(Board, tree, f"board {path}, {{}}")
 
 
+def read_boards(paths: Sequence[Path]) -> list[Board]:
+    """Reads the descriptions of boards that are used together. Raises SaccadeError as `read_board` does, or if two of
+    them share a marker."""
+    boards = [read_board(path) for path in paths]
+    for number, one in enumerate(boards):
+        for before, other in zip(paths, boards[:number], strict=False):
+            alike = one.dictionary[0] == other.dictionary[0]  # markers of one size: larger sets contain the smaller
+            if alike and set(one.markers) & set(other.markers):
+                raise SaccadeError(f"boards {before} and {paths[number]} have markers in common, so that they could "
+                                   "not be told apart: print one of them anew with `saccade board --number 2`")
+    return boards
+
+
 @dataclass(frozen=True)
 class Corners:
     """Corners of a board in an image: their numbers [N], and their pixels [N, 2] from the corner of the first pixel."""
@@ -124,7 +146,8 @@ class Finder:
     def opencv_board(self) -> Any:
         """The board as OpenCV knows it."""
         aruco, board = self._cv2.aruco, self.board
-        made = aruco.CharucoBoard(board.squares, board.square_m, board.marker_m, _dictionary(aruco, board))
+        made = aruco.CharucoBoard(board.squares, board.square_m, board.marker_m, _dictionary(aruco, board),
+                                  np.array(board.markers, dtype=np.int32))
         made.setLegacyPattern(board.legacy_pattern)
         return made
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from saccade.services.camera.calibration import read_calibration
-from saccade.services.camera.charuco import read_board
+from saccade.services.camera.charuco import read_boards
 from saccade.services.camera.poses import Poses, asked_of, read_poses
 from saccade.services.camera.ros.source import RosSource, is_ros, open_ros_source
 from saccade.services.camera.ros.stream import with_lens
@@ -129,6 +129,9 @@ def require_one_of_each(camera: CameraConfig) -> None:
     """Raises SaccadeError if two keys tell the same, or if the board's poses need what is not given."""
     if camera.board is not None and camera.poses is not None:
         raise SaccadeError("camera.board and camera.poses both tell the camera's poses: give one of them")
+    if camera.more_boards and camera.board is None:
+        raise SaccadeError("camera.more_boards without camera.board: the first board, whose middle is the world's "
+                           "origin, is camera.board")
     if camera.calibration is not None and camera.intrinsics_px is not None:
         raise SaccadeError("camera.calibration and camera.intrinsics_px both tell the intrinsics: give one of them")
     given = camera.calibration is not None or camera.intrinsics_px is not None
@@ -165,7 +168,8 @@ def _by_board(camera: CameraConfig, source: Source, lens: Lens | None) -> BoardP
         raise SaccadeError(BOARD_NEEDS)
     from saccade.services.camera.board_poses import BoardPoses  # loads a filter that nothing else here needs
 
-    return BoardPoses(read_board(camera.board), lens, camera.board, smooth=not isinstance(source, Folder))
+    board, *more = read_boards((camera.board, *camera.more_boards))
+    return BoardPoses(board, lens, camera.board, smooth=not isinstance(source, Folder), more=more)
 
 
 def _goal_of(config: Config, virtual_camera: VirtualCamera) -> GoalImage | None:
@@ -210,5 +214,5 @@ def _notes(virtual_camera: VirtualCamera, lens: Lens | None, *, still: bool) -> 
         x, y, z = start_pose()[:3, 3]
         notes.append(f"camera.poses is not given: the camera is assumed to stand still at ({x:.2f}, {y:.2f}, {z:.2f}) "
                      "m and to look at the table's centre; if it moves or stands elsewhere, the positions of objects "
-                     "and viewpoints are wrong")
+                     "and viewpoints are wrong; `saccade see --map` makes a map of the objects from pictures alone")
     return tuple(notes)

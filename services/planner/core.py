@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from saccade.services.planner.declaring import UNLIKELY, Evidence, Rivals, fused_here
 from saccade.services.planner.free_energy import Terms, expected_free_energy
 from saccade.services.planner.goal import Preference, aim, infer_preference
 from saccade.services.planner.goal_views import Side, nearest_eye
@@ -35,6 +36,7 @@ from saccade.shared.world.geometry import (
     viewing_grid,
     wrap,
 )
+from saccade.shared.world.symmetry import NONE
 from saccade.shared.world.task import LOWER_M, UPPER_M, Spheres, clip, spheres_around, success
 
 SERVICE = Service("planner", inputs=(BELIEF, GOAL_PERCEPT), trigger=BELIEF, outputs=(PLAN, ACTION))
@@ -55,7 +57,7 @@ VISITED_M = 0.05  # chosen: viewpoints within about this distance of one that wa
 VISITED_RAD = 0.35  # chosen: viewpoints within about this angle of one that was not the goal's also become costly
 VISITED_COST = 6.0  # chosen: nats that are added to the cost of a viewpoint that was not the goal's
 DOUBT_LIMIT = 2.5  # chosen: after wrong viewpoints the goal's log posterior is divided by at most this
-SURE = 0.6  # chosen: the agent says that it is at the goal's view if the probability of this is higher
+SURE_ALONE = 0.6  # chosen: the same without second thoughts: the probability by the present view alone
 PEAK_ROWS = 2  # chosen: the posterior's peak is averaged over this many cells of elevation on each side
 PEAK_COLUMNS = 4  # chosen: the posterior's peak is averaged over this many cells of azimuth on each side
 PUBLISHED = 64  # number of candidates in a plan message; it changes nothing that the agent does
@@ -80,6 +82,8 @@ class Planner:
         self.age = 0  # steps since the plan was chosen
         self.before: Array | None = None  # pose of the camera at the last step [4, 4]
         self.hand = Hand(self.config.planner.replan_every) if self.moved_by == "hand" else None
+        self.rivals = Rivals()
+        self.wanted: Array | None = None  # the rival direction [3] from which the agent is about to look
         self.visited: list[Array] = []  # camera poses [4, 4] at which the agent has arrived in the mode "goal"
         return ()
 
@@ -96,6 +100,7 @@ class Planner:
             known = preference.confidence >= self.config.planner.goal_confidence
             self.preference = preference if known and not self.config.scene.explore else None
         self._refine(beliefs)
+        self._note_rivals(beliefs)
         spheres = self.obstacles(beliefs)
         chosen, mode, eye = self.plan, self._mode(beliefs), self._believed_eye(beliefs, camera, spheres)
         moved = self._moved if self.hand is None else self._followed
@@ -125,9 +130,14 @@ class Planner:
         """Whether the plan is to be renewed, and whether the agent says that it has arrived."""
         arrived, declared = chosen is not None and self._arrived(camera, chosen.viewpoint), False
         if chosen is not None and arrived and chosen.mode == "goal":
-            declared = beliefs[chosen.target].goal_here > SURE
-            if self.config.planner.retry:
-                self.visited.append(camera)
+            target = beliefs[chosen.target]
+            if not self.config.planner.retry:
+                declared = target.goal_here > SURE_ALONE
+            else:
+                evidence = self._evidence(target, camera)
+                declared = evidence.is_enough
+                self._has_looked(target, camera, evidence.look,
+                                 wrong=not evidence.rival or evidence.probability < UNLIKELY)
         self.age += 1
         due = chosen is None or arrived or mode != chosen.mode or self.age >= self.config.planner.replan_every
         return due, declared
@@ -139,11 +149,32 @@ class Planner:
             return True, False
         if mode != chosen.mode and not self.hand.there:
             return True, False
-        goal_here = beliefs[chosen.target].goal_here if chosen.mode == "goal" else None
-        verdict = self.hand.take(camera, goal_here, eye)
-        if verdict == "wrong" and self.config.planner.retry:
+        target = beliefs[chosen.target] if chosen.mode == "goal" else None
+        evidence = None if target is None else self._evidence(target, camera)
+        eye = eye if self.wanted is None else None  # whoever looks from elsewhere is not led back before
+        verdict = self.hand.take(camera, evidence, eye)
+        if verdict in ("wrong", "rival") and target is not None:
+            self._has_looked(target, camera, self.hand.look, wrong=verdict == "wrong")
+        return verdict in ("renew", "wrong", "rival"), verdict == "there"
+
+    def _note_rivals(self, beliefs: dict[str, Belief]) -> None:
+        """Keeps in mind which directions are likely now. Views that look the same are no rivals."""
+        if self.preference is not None and self.config.planner.retry \
+                and self.symmetry[self.preference.target] == NONE:
+            self.rivals.take(beliefs[self.preference.target])
+
+    def _evidence(self, target: Belief, camera: Array) -> Evidence:
+        fused = fused_here(target, camera, self.symmetry[target.object])
+        return Evidence(target.goal_here, fused,
+                        self.rivals.beside(camera, target.mean_m) is not None,
+                        self.rivals.elsewhere(camera, target.mean_m))
+
+    def _has_looked(self, target: Belief, camera: Array, look: float, *, wrong: bool) -> None:
+        """The agent has arrived and looked, and goes on: to a rival, if the view may be the goal's all the same."""
+        self.rivals.looked(camera, target.mean_m, look)
+        self.wanted = None if wrong else self.rivals.beside(camera, target.mean_m)
+        if wrong and self.config.planner.retry:
             self.visited.append(camera)
-        return verdict in ("renew", "wrong"), verdict == "there"
 
     def _arrived(self, camera: Array, viewpoint: Array) -> bool:
         """Whether the camera is at the viewpoint, or as near as it can come."""
@@ -190,7 +221,8 @@ class Planner:
         eyes, gazes = self._candidates(beliefs, rng)
         if found is not None and (log_posterior := beliefs[found.target].goal_log_posterior) is not None:
             target = beliefs[found.target]
-            eye = self._goal_eye(target, log_posterior, found.range_m, camera, spheres)
+            eye = self._goal_eye(target, log_posterior, found.range_m, camera, spheres) if self.wanted is None \
+                else target.mean_m + found.range_m * self.wanted
             best, side = self._goal_viewpoint(found, target, eye), self._side(target, eye)
             eyes, gazes = np.vstack([side.eyes(eyes), best[:3, 3]]), np.vstack([gazes, target.mean_m])
         eyes = np.clip(eyes, LOWER_M, UPPER_M)
@@ -200,7 +232,7 @@ class Planner:
             cost = cost + self._visited_cost(eyes, self._side(beliefs[found.target], eyes[-1]))
         else:  # of equally informative viewpoints the nearest is taken
             cost = terms.total + NEARER * np.linalg.norm(eyes - camera[:3, 3], axis=1)
-        chosen = int(np.argmin(cost))
+        chosen = int(np.argmin(cost)) if self.wanted is None or best is None else len(eyes) - 1
         if found is None or best is None:
             viewpoint = look_at(clip(eyes[chosen], spheres), gazes[chosen])
         elif chosen == len(eyes) - 1:

@@ -6,14 +6,14 @@ from typing import Literal
 
 import numpy as np
 
+from saccade.services.planner.declaring import UNLIKELY, Evidence
 from saccade.shared.world.geometry import Array, pose, rotation_angle
 from saccade.shared.world.guidance import NEAR_M, NEAR_RAD
 from saccade.shared.world.task import Spheres, clip, success
 
-Verdict = Literal["stay", "renew", "wrong", "there"]
+Verdict = Literal["stay", "renew", "wrong", "rival", "there"]
 
 LOOKS, MOST_LOOKS = 5, 15  # chosen: at least and at most so many images decide whether a view is the goal's
-LIKELY, UNLIKELY = 0.5, 0.25  # chosen: means of the looks above which a view is the goal's, and below which it is not
 PATIENCE = 20  # chosen: after so many images within the task's tolerance a hand will not come nearer
 ELSEWHERE_M = 0.15  # chosen: a hand goes elsewhere if it is so much farther from the viewpoint than it has been
 MOVED_M = 0.03  # chosen: a plan is renewed if the believed view of the goal moves by more than this
@@ -39,40 +39,48 @@ class Hand:
         self._looks: list[float] = []
         return self._viewpoint
 
-    def take(self, camera: Array, goal_here: float | None, eye: Array | None) -> Verdict:
+    def take(self, camera: Array, evidence: Evidence | None, eye: Array | None) -> Verdict:
         """Takes the camera's pose [4, 4] in an image.
 
         A viewpoint from which to search is reached within the task's tolerance. At one that may be the goal's,
-        `goal_here` is the probability that it is, by this image. There the camera must be nearer, unless it has not
-        come nearer for a while, and the mean of several images decides.
+        `evidence` speaks for it, by this image and by all. There the camera must be nearer, unless it has not come
+        nearer for a while, and the mean of several images decides. The verdict `rival` asks for a look from another
+        direction before.
         """
         self._age += 1
         if self.there:
             return "there" if success(camera, self._viewpoint) else "stay"
-        if goal_here is not None and self._age >= self._renewed_after and self._has_moved(eye, MOVED_M):
+        if evidence is not None and self._age >= self._renewed_after and self._has_moved(eye, MOVED_M):
             return "renew"
         away_m = float(np.linalg.norm(camera[:3, 3] - self._viewpoint[:3, 3]))
         self._nearest_m = min(self._nearest_m, away_m)
         if not success(camera, self._viewpoint):
             self._looks.clear()
             return "renew" if away_m > self._nearest_m + ELSEWHERE_M else "stay"
-        if goal_here is None:
+        if evidence is None:
             return "renew"
-        self._looks.append(goal_here)
+        self._looks.append(evidence.look)
         near = away_m < NEAR_M and rotation_angle(camera[:3, :3], self._viewpoint[:3, :3]) < NEAR_RAD
         if len(self._looks) < (LOOKS if near else PATIENCE):
             return "stay"
         if self._has_moved(eye, SHIFTED_M):
             return "renew"
-        return self._judge()
+        return self._judge(evidence)
 
-    def _judge(self) -> Verdict:
+    def _judge(self, evidence: Evidence) -> Verdict:
         """Whether the view is the goal's, by the looks at it so far; `stay` asks for more of them."""
-        mean = float(np.mean(self._looks[-MOST_LOOKS:]))
-        self.there = mean > LIKELY
+        evidence = evidence._replace(look=self.look)
+        self.there = evidence.is_enough
         if self.there:
             return "there"
-        return "wrong" if mean < UNLIKELY or len(self._looks) >= MOST_LOOKS else "stay"
+        if evidence.rival and evidence.probability >= UNLIKELY:
+            return "rival"
+        return "wrong" if evidence.probability < UNLIKELY or len(self._looks) >= MOST_LOOKS else "stay"
+
+    @property
+    def look(self) -> float:
+        """The mean of the looks at the viewpoint so far. 0 before the first."""
+        return float(np.mean(self._looks[-MOST_LOOKS:])) if self._looks else 0.0
 
     def _has_moved(self, eye: Array | None, by_m: float) -> bool:
         if eye is None or self._eye is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from saccade.services.camera.trajectories.lens import lens
 from saccade.shared.world.geometry import direction, look_at, pose
 
 SHEET = Board(squares=(7, 10), square_m=0.025, marker_m=0.019)
+SECOND = SHEET.model_copy(update={"first_marker": 35})
 SIZE = (640, 480)
 FOCAL = {"fx": 610.0, "fy": 612.0, "cx": 325.0, "cy": 236.0}
 PINHOLE = lens(FOCAL | {"k1": -0.21, "k2": 0.07, "p1": 0.001, "p2": -0.0012, "k3": -0.01}, SIZE)
@@ -43,6 +45,18 @@ def seen(world_from_camera, camera=PINHOLE, board: Board = SHEET, sheet: np.ndar
     fine = cv2.remap(sheet, places, None, cv2.INTER_LINEAR, borderValue=0.55)
     grey = 30 + 200 * fine.reshape(height, SAMPLES, width, SAMPLES).mean((1, 3))
     return np.repeat(grey.round().astype(np.uint8)[..., None], 3, axis=2)
+
+
+def both_on_the_table(world_from_camera) -> np.ndarray:
+    """The image [H, W, 3] of SHEET at the origin and of SECOND, turned by 90 degrees, at (0.30, -0.02)."""
+    sheets, width = [printed(SHEET), np.rot90(printed(SECOND))], 0.56
+    canvas = np.full((round(0.30 * TEXELS_PER_M), round(width * TEXELS_PER_M)), 0.55, np.float32)
+    for sheet, (x, y) in zip(sheets, ((0.12, 0.15), (0.42, 0.13)), strict=True):
+        top, left = (round(TEXELS_PER_M * at) - side // 2 for at, side in zip((y, x), sheet.shape, strict=True))
+        canvas[top:top + sheet.shape[0], left:left + sheet.shape[1]] = sheet
+    whole = SimpleNamespace(size_m=np.array([width, 0.30]) - 2 * MARGIN_M)
+    moved = pose(world_from_camera[:3, :3], world_from_camera[:3, 3] - (width / 2 - 0.12, 0.0, 0.0))
+    return seen(moved, board=whole, sheet=canvas)
 
 
 @cache

@@ -1,0 +1,100 @@
+"""When the agent says that the camera is at the goal's view.
+
+Two things must agree: the looks from there, and what all views together say. Where another direction was once about as
+likely, as with the two sides of a can, the agent looks from there too before it says so, unless the looks are clear. If
+the looks from both sides are good, the better ones decide: of all views there are more from where it was longer.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from saccade.shared.bus.messages import Belief
+from saccade.shared.world.directions import alike
+from saccade.shared.world.geometry import Array, direction, unit, viewing_grid
+
+SURE = 0.6  # chosen: the agent says so if looks and fused views together leave at least this probability
+UNLIKELY = 0.25  # chosen: a view that has a lower probability is not the goal's
+CLEAR = 0.93  # chosen: looks that are clearer than this need no look at rivals; a view that may be wrong reaches 0.95
+FLOOR = 0.02  # chosen: neither the looks nor the fused views count as surer than this leaves
+RIVAL = 0.25  # chosen: a direction with this probability around it is a rival of the likeliest one
+AROUND_RAD, APART_RAD = 0.4, 0.8  # chosen: what counts as around a direction, and how far rivals are from one another
+
+
+class Evidence(NamedTuple):
+    """What speaks for the goal's view being here: the probability by the looks from here, that by all views, whether a
+    rival direction is left from which the agent has not looked, and the probability by the best looks elsewhere."""
+
+    look: float
+    fused: float
+    rival: bool = False
+    elsewhere: float = 0.0
+
+    @property
+    def probability(self) -> float:
+        """The probability that the goal's view is here."""
+        return together(self.look, self.fused if self.elsewhere < UNLIKELY else 1.0 - self.elsewhere)
+
+    @property
+    def is_enough(self) -> bool:
+        """Whether the agent says that the camera is there."""
+        return self.probability > SURE and (self.look > CLEAR or not self.rival)
+
+
+def together(looks: float, fused: float) -> float:
+    """The probability that two sources of evidence give together, each of which alone gives one: the product of their
+    odds."""
+    odds = np.prod([p / (1 - p) for p in np.clip([looks, fused], FLOOR, 1 - FLOOR)])
+    return float(odds / (1 + odds))
+
+
+def fused_here(target: Belief, camera: Array, symmetry: int) -> float:
+    """Probability by all views that the goal image was taken from about the direction of a camera [4, 4]. 0 without a
+    posterior."""
+    if target.goal_log_posterior is None:
+        return 0.0
+    share = np.exp(target.goal_log_posterior.astype(np.float64))
+    return float(share[alike(camera[:3, 3], target.mean_m, symmetry)].sum() / share.sum())
+
+
+class Rivals:
+    """Directions [3] from the target that have once been likely, and from which the agent has not looked yet."""
+
+    def __init__(self) -> None:
+        self.directions: list[Array] = []
+        self._seen: list[tuple[Array, float]] = []  # directions, and the looks from there
+
+    def take(self, target: Belief) -> None:
+        """Takes the directions that are likely by now: the likeliest, and the likeliest that is far from it."""
+        if target.goal_log_posterior is None:
+            return
+        share = np.exp(target.goal_log_posterior.astype(np.float64)).ravel()
+        share /= share.sum()
+        rows, columns = viewing_grid()
+        towards = direction(*reversed(np.meshgrid(rows, columns, indexing="ij"))).reshape(-1, 3)
+        left = np.ones(len(share), dtype=bool)
+        for _ in range(2):
+            peak = towards[np.argmax(np.where(left, share, -1.0))]
+            if share[towards @ peak > np.cos(AROUND_RAD)].sum() < RIVAL:
+                return
+            if all(peak @ known < np.cos(APART_RAD) for known in (*self.directions, *(seen for seen, _ in self._seen))):
+                self.directions.append(peak)
+            left &= towards @ peak < np.cos(APART_RAD)
+
+    def looked(self, camera: Array, center: Array, look: float) -> None:
+        """The agent has looked at the target from the pose of a camera [4, 4]: the probability by these looks."""
+        here = unit(camera[:3, 3] - center)
+        self._seen = [each for each in self._seen if each[0] @ here < np.cos(AROUND_RAD)] + [(here, look)]
+        self.directions = [each for each in self.directions if each @ here < np.cos(APART_RAD)]
+
+    def elsewhere(self, camera: Array, center: Array) -> float:
+        """The best look from a direction far from that of a camera [4, 4]. 0 if there was none."""
+        here = unit(camera[:3, 3] - center)
+        return max((look for seen, look in self._seen if seen @ here < np.cos(APART_RAD)), default=0.0)
+
+    def beside(self, camera: Array, center: Array) -> Array | None:
+        """A rival [3] of the direction of a camera [4, 4]. None if there is none."""
+        here = unit(camera[:3, 3] - center)
+        return next((each for each in self.directions if each @ here < np.cos(APART_RAD)), None)
