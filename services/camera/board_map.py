@@ -104,7 +104,8 @@ def _fused(placed: list[Measured]) -> Measured:
     camera = pose(Rotation.from_rotvec(step[3:]).as_matrix() @ reference[:3, :3], reference[:3, 3] + step[:3])
     corners = sum(one.corners for one in placed)
     rms_px = float(np.sqrt(sum(one.corners * one.rms_px ** 2 for one in placed) / corners))
-    return Measured(camera, np.linalg.inv(information), rms_px, corners)
+    covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
+    return Measured(camera, covariance, rms_px, corners)
 
 
 def _median(poses: Sequence[Array]) -> Array:
