@@ -141,10 +141,10 @@ def test_an_episode_is_judged_up_to_the_symmetry_of_its_target(symmetry):
     center = np.array([0.0, 0.0, 0.055])
     goal = look_at(center + 0.35 * direction(np.pi, 0.7), center)
     simulator = Simulator(Blind(mesh), [Scene("s", "can", (9, 9, 9), (Placed("can", center, 0.0),), goal)])
-    truth = {o.topic.name: o.message for o in simulator.begin("r", 0)}["truth"]
-    oracle = Oracle()
+    first = {o.topic.name: o.message for o in simulator.begin("r", 0)}
+    truth, oracle = first["truth"], Oracle()
     while not truth.done:
-        action = oracle.step({"truth": truth})[0].message
+        action = oracle.step({"truth": truth, "goal": first["goal"]})[0].message
         truth = {o.topic.name: o.message for o in simulator.step({"action": action})}["truth"]
     result = result_of(truth)
     assert result.success
