@@ -23,7 +23,7 @@ from saccade.app.run.registry import agent_of
 from saccade.services.perception.core import Model, model_of
 from saccade.shared.config import load
 from saccade.shared.errors import SaccadeError
-from saccade.shared.files import replace_whole
+from saccade.shared.files import replace_whole, writing
 from saccade.shared.log.provenance import commit
 from saccade.shared.model.weights import weights_in_use
 from saccade.shared.render.mesh import Mesh, read_obj
@@ -53,11 +53,10 @@ def presences(model: Model, mesh: Mesh, views: int, rng: np.random.Generator) ->
 
 def strangers(folders: list[Path], names: tuple[str, ...]) -> list[Path]:
     """The folders of objects that are not known. Raises SaccadeError if there are none."""
-    found = sorted(mesh.parent for folder in folders for mesh in folder.glob("*/*.obj"))
-    found = [folder for folder in found if folder.name not in names]
+    found = {mesh.parent for folder in folders for mesh in folder.glob("*/*.obj") if mesh.parent.name not in names}
     if not found:
         raise SaccadeError(f"no objects in {', '.join(map(str, folders))}: each needs a folder of its own with an .obj")
-    return list(dict.fromkeys(found))
+    return sorted(found)
 
 
 def counted(taken: list[float], limit: float) -> dict[str, Any]:
@@ -100,9 +99,10 @@ def main() -> None:
     options, console = parser.parse_args(), Console()
     try:
         results = measure(options, console)
+        with writing(options.out, "results"):
+            replace_whole(options.out, (json.dumps(results, indent=1) + "\n").encode())
     except SaccadeError as error:
         parser.exit(2, f"saccade: {error}\n")
-    replace_whole(options.out, (json.dumps(results, indent=1) + "\n").encode())
     for kind in ("strangers", "known"):
         for each in results[kind]:
             console.print(f"{kind}: {each['count']} of {each['images']} above {each['above']} "

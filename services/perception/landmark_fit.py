@@ -13,7 +13,7 @@ from torch import Tensor
 from saccade.services.perception.local_features import Features
 from saccade.shared.model.bank import FILLED
 from saccade.shared.model.landmarks import Landmarks
-from saccade.shared.world.geometry import pose, unit
+from saccade.shared.world.geometry import pose, project, unit
 
 FEATURES = 600  # of a crop
 QUICK_FEATURES, QUICK_LANDMARKS = 400, 2_000  # the surest, where one image after the other is seen
@@ -110,15 +110,13 @@ class LandmarkFit:
 
     def _confirmed(self, pixels: Array, which: NDArray[np.int64], camera: dict[str, Any]) -> int:
         """How many of the landmarks `which` [M], in two halves, are where the pose by the other half puts them."""
-        count, most = 0, LOOSE * ERROR * camera["width"]
+        count, middle, focal = 0, camera["width"] / 2, camera["params"][0]
         first = np.arange(len(which)) % 2 == 0
         for told_by in (first, ~first):
-            pose_told, _ = _agreed(pixels[told_by], self.points_m[which[told_by]], camera, TRIES_CHECKED)
-            right, up, back = pose_told[:3, :3] @ self.points_m[which[~told_by]].T + pose_told[:3, 3:]
-            ahead = np.maximum(-back, 1e-6)
-            seen = camera["width"] / 2 + camera["params"][0] * np.stack([right / ahead, -up / ahead], 1)
+            told, _ = _agreed(pixels[told_by], self.points_m[which[told_by]], camera, TRIES_CHECKED)
+            seen, depth = project(self.points_m[which[~told_by]], np.linalg.inv(told), (focal, focal, middle, middle))
             off = np.linalg.norm(seen - pixels[~told_by], axis=1)
-            count += int(((off < most) & (back < 0)).sum())
+            count += int(((off < LOOSE * ERROR * camera["width"]) & (depth > 0)).sum())
         return count
 
     def _fit(self, pixels: Array, which: NDArray[np.int64], camera: dict[str, Any]) -> Fit | None:

@@ -272,10 +272,11 @@ def _may_be(k: int, thing: int, fits: Mapping[tuple[int, int], Fit], similar: Se
 
 def _left(pairs: list[tuple[int, int, int]], fits: Mapping[tuple[int, int], Fit], similar: Sequence[Tensor]) -> \
         list[tuple[int, int, int]]:
-    """The pairs (object, thing, view) that are worth a comparison: at least one of each object."""
-    left = [pair for pair in pairs if _may_be(pair[0], pair[1], fits, similar)]
+    """The pairs (object, thing, view) that are worth a comparison, in their order: at least one of each object."""
+    left = {pair for pair in pairs if _may_be(pair[0], pair[1], fits, similar)}
     told = {k for k, _, _ in left}
-    return sorted(left + [next(pair for pair in pairs if pair[0] == k) for k in range(len(similar)) if k not in told])
+    first = {k: pair for pair in reversed(pairs) if (k := pair[0]) not in told}
+    return [pair for pair in pairs if pair in left or first.get(pair[0]) == pair]
 
 
 def _nothing(count: int, shape: tuple[int, ...]) -> Seen:

@@ -71,9 +71,8 @@ def find_way(space: Space, start: ArrayLike, goals: ArrayLike) -> tuple[Array, i
     if not len(joined):
         return None
     first = joined[np.argsort(np.linalg.norm(lattice.points_m[joined] - here, axis=1))]
-    lengths, before, sources = dijkstra(lattice.lengths_m, directed=False, indices=first, min_only=True,
-                                        return_predecessors=True)
-    del sources
+    lengths, before, _ = dijkstra(lattice.lengths_m, directed=False, indices=first, min_only=True,
+                                  return_predecessors=True)
     best: tuple[float, int, int] | None = None
     for k, end in enumerate(ends):
         for point in _joined(space, lattice, end):
