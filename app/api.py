@@ -60,7 +60,8 @@ def run(*, goal: str | Path | ArrayLike | None = None, agent: str | None = None,
     `goal` is an image to find: a file, or an array [H, W, 3] of uint8; `goal_intrinsics_px` are its (fx, fy, cx, cy).
     Without it the goal comes from the simulator's scene, and with a real camera the agent explores. `config` is a
     configuration file or the name of a preset; the other keywords override its values. `out` is a new folder for the
-    run, by default `runs/<time>-<seed>`. Without `agent` it is `sceneccn`, or `open` for a set of your own.
+    run, by default `runs/<time>-<seed>`. Without `agent` it is `sceneccn`, or `open` for objects of your own, for
+    photographs, and for any light that is not flat.
     With `show` the progress is printed. Raises SaccadeError if something is wrong that the user can repair.
     """
     from saccade.app.look.picture import draw_run  # here, so that matplotlib is only loaded when it is needed
@@ -90,7 +91,8 @@ class Agent(_Agent):
     `goal` is the image to reach: a file, or an array [H, W, 3] of uint8. Without a goal the agent explores.
     `intrinsics` are (fx, fy, cx, cy) of your images, in pixels. Without them, an image of 480x480 pixels is taken as an
     image of the training's camera, and of any other image the central square is used. Without `agent` it is `sceneccn`,
-    or `open` for a set of your own. Raises SaccadeError if the configuration or the goal cannot be used.
+    which knows flat light alone, or `open` for objects of your own: for a real camera, name `open`. Raises
+    SaccadeError if the configuration or the goal cannot be used.
     """
 
     def __init__(self, *, goal: str | Path | ArrayLike | None = None, intrinsics: Sequence[float] | None = None,

@@ -19,6 +19,7 @@ PACKAGE = Path(__file__).resolve().parent.parent  # the folder of `saccade`: in 
 PRESETS, WEIGHTS = PACKAGE / "shared" / "presets", PACKAGE / "weights"
 
 BUILT_IN_SETS = ("pantry", "ycb")
+FLAT_LOOK = "flat"
 MAX_FILE_BYTES = 1 * MIB
 MAX_TEXT = 1024  # characters of a value; paths are the longest
 MANY = 1_000_000  # limit for steps, scenes and the like; more would never end
@@ -133,7 +134,7 @@ class SimulatorConfig(Section):
     agent says that it has arrived."""
     publish_depth: bool = False
     """Whether frames carry depth. PoseCNN uses it."""
-    look: str = "flat"
+    look: str = FLAT_LOOK
     """Light, surfaces and the camera's faults: the name of a look that comes with Saccade, or a TOML file."""
     goal_look: str | None = None
     """The look of the goal image, if it is another one."""

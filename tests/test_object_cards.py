@@ -152,6 +152,18 @@ def test_without_a_word_the_agent_is_the_one_that_knows_the_objects(home, tmp_pa
     assert capsys.readouterr().out == ""
 
 
+@pytest.mark.parametrize(("keys", "why"), [
+    ({"simulator.look": "room"}, "any light"), ({"simulator.goal_look": "dim"}, "any light"),
+    ({"camera.source": "webcam:0"}, "photographs"), ({"scene.goal_image": "view.png"}, "photographs")])
+def test_in_other_light_and_for_photographs_it_is_the_agent_that_was_made_for_them(keys, why, tmp_path, capsys):
+    assert configured(None, keys, None, None)[1] == "open"
+    assert capsys.readouterr().out.startswith(f"the agent is open, because it is the one for {why}: `--agent`")
+    assert configured(None, keys, None, "sceneccn")[1] == "sceneccn"
+    assert configured(None, keys | {"perception.weights": tmp_path}, None, None)[1] == "sceneccn"
+    assert configured(None, {"simulator.look": "flat", "simulator.goal_look": "flat"}, None, None)[1] == "sceneccn"
+    assert capsys.readouterr().out == ""
+
+
 def test_in_python_too(home):
     added(can(name="tea"))
     with pytest.raises(SaccadeError, match=r"weights-open/manifest.json are missing"):

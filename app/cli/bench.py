@@ -48,9 +48,11 @@ def bench(*, objects: Objects = None, scenes: ScenesFile = None,
 
     from saccade.app.bench.bench import bench as run_bench
     from saccade.app.bench.bench import prepare
+    from saccade.services.simulator.suites import SUITES
 
+    of_suite = dict(SUITES[suite].values) if suite in SUITES else {}
     resolved, agent = configured(config, {"scene.objects": objects, "scene.file": scenes, "seed": seed,
-                                          "perception.weights": weights}, values, agent)
+                                          "perception.weights": weights} | of_suite, values, agent)
     if yaw is not None and (resolved.scene.file is not None or suite is not None):
         raise SaccadeError("--yaw is for scenes that are drawn: leave it or --scenes and --suite out")
     if yaw is not None:

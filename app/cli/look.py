@@ -109,13 +109,13 @@ def see(photos: Annotated[list[Path], typer.Argument(metavar="PHOTO...", help="P
 
     from saccade.app.cli.texts import configured, numbers, split_names
     from saccade.app.look.see import see as look_at
-    from saccade.app.run.registry import AGENT_OF_PHOTOGRAPHS
+    from saccade.app.run.registry import OPEN
 
     given = numbers(intrinsics)
     if given is not None and len(given) != 4:
         raise SaccadeError(f"--intrinsics {intrinsics!r}: write fx,fy,cx,cy, such as 615,615,320,240")
     if agent is None and weights is None:
-        agent = AGENT_OF_PHOTOGRAPHS
+        agent = OPEN
     config, agent = configured(None, {"scene.objects": objects, "scene.names": split_names(names),
                                       "perception.weights": weights}, None, agent)
     if look_at(photos, config, agent=agent, intrinsics_px=given, json_file=json_file, out=out, console=wide(Console()),

@@ -13,7 +13,7 @@ from saccade.app.run.launch import JUDGE, RECORDER
 from saccade.app.run.supervisor import GUIDE, ROS, VIEWER, Process
 from saccade.app.run.threads import limit_torch
 from saccade.shared.bus.topics import TRUTH
-from saccade.shared.config import BUILT_IN_SETS, Config
+from saccade.shared.config import BUILT_IN_SETS, FLAT_LOOK, Config
 from saccade.shared.config import load as load_config
 from saccade.shared.errors import SaccadeError
 from saccade.shared.loop.modules import chosen_module, load
@@ -54,7 +54,7 @@ class Agent:
     knows: str = "RGB, camera pose"
 
 
-DEFAULT_AGENT, AGENT_OF_OWN_SETS, AGENT_OF_PHOTOGRAPHS = "sceneccn", "open", "open"
+DEFAULT_AGENT, OPEN = "sceneccn", "open"
 ALL_THREE = ("perception", "belief", "planner")
 AGENTS = {
     "sceneccn": Agent(ALL_THREE),
@@ -80,14 +80,26 @@ def agent_of(name: str) -> Agent:
 def configuration(path: Path | None, keys: Mapping[str, Any], agent: str | None = None) -> tuple[Config, str]:
     """The configuration and the name of its agent: the agent's preset, over it the file, over it the dotted keys.
 
-    Without the name of an agent it is the one that knows the configured objects: `open` for a set of the user's,
-    unless weights are given. Raises SaccadeError if the agent is unknown, or if the file, a key or a value is wrong.
+    Without the name of an agent it is `sceneccn`, or `open` where there is a reason for it (`reason_for_open`). Raises
+    SaccadeError if the agent is unknown, or if the file, a key or a value is wrong.
     """
     if agent is None:
-        given = load_config(path).with_values(dict(keys))
-        is_own = given.scene.objects not in BUILT_IN_SETS and given.perception.weights is None
-        agent = AGENT_OF_OWN_SETS if is_own else DEFAULT_AGENT
+        agent = DEFAULT_AGENT if reason_for_open(load_config(path).with_values(dict(keys))) is None else OPEN
     return load_config(path, agent_of(agent).preset).with_values(dict(keys)), agent
+
+
+def reason_for_open(config: Config) -> str | None:
+    """Why the agent `open` is the one for this configuration. None if `sceneccn` is, which knows the built-in objects
+    in flat light, or the given weights."""
+    if config.perception.weights is not None:
+        return None
+    if config.scene.objects not in BUILT_IN_SETS:
+        return "it is the one that knows objects of your own"
+    if config.camera.source is not None or config.scene.goal_image is not None:
+        return "it is the one for photographs"
+    if (config.simulator.look, config.simulator.goal_look or FLAT_LOOK) != (FLAT_LOOK, FLAT_LOOK):
+        return "it is the one for any light"
+    return None
 
 
 def world_of(name: str) -> World:

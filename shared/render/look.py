@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from pydantic import ConfigDict, Field, FiniteFloat, ValidationInfo, field_validator
 
-from saccade.shared.config import Section, checked
+from saccade.shared.config import FLAT_LOOK, Section, checked
 from saccade.shared.errors import SaccadeError, told
 from saccade.shared.files import MIB, parse_toml, read_text
 from saccade.shared.render.surfaces import SIDE_PX, SURFACES, surface
@@ -125,13 +125,13 @@ def load_look(name: str) -> Look:
 
     Raises SaccadeError if it is missing, or if a key or a value in it is wrong.
     """
-    if name == "flat":
+    if name == FLAT_LOOK:
         return FLAT
     path = LOOKS / f"{name}.toml"
     if not path.is_file():
         path = Path(name)
         if not path.is_file():
-            known = ", ".join(sorted(("flat", RANDOM, *(each.stem for each in LOOKS.glob("*.toml")))))
+            known = ", ".join(sorted((FLAT_LOOK, RANDOM, *(each.stem for each in LOOKS.glob("*.toml")))))
             raise SaccadeError(f"look {told(name)} is unknown: choose from {known}, or give a TOML file")
     text = read_text(path, "look", _NEED, MAX_FILE_BYTES)
     try:
