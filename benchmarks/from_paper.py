@@ -35,7 +35,7 @@ STEPS: tuple[tuple[str, tuple[str, ...]], ...] = (
 )
 
 
-def _value(tree: dict[str, Any], key: str) -> Any:
+def value_of(tree: dict[str, Any], key: str) -> Any:
     return reduce(lambda node, part: node[part], key.split("."), tree)
 
 
@@ -44,7 +44,7 @@ def measure(out: Path, limit: int | None, console: Console) -> list[tuple[str, R
     ours, config = Config().model_dump(mode="json"), load(None, "paper").with_values({"scene.objects": "ycb"})
     found = []
     for number, (name, keys) in enumerate(STEPS):
-        config = config.with_values({key: _value(ours, key) for key in keys})
+        config = config.with_values({key: value_of(ours, key) for key in keys})
         path = out / f"{number:02}.json"
         if not path.is_file():
             console.print(name)
@@ -56,19 +56,20 @@ def measure(out: Path, limit: int | None, console: Console) -> list[tuple[str, R
 
 def page(found: list[tuple[str, Results]]) -> str:
     """The steps as a Markdown table: success with Wilson's interval, median steps, and the change of success from the
-    row above, over the same scenes, with its standard error."""
-    lines = ["| each row keeps what the rows above have | success (%) | change | median steps |",
-             "| --- | --- | --- | --- |"]
+    row above, over the scenes that both have, with its standard error."""
+    lines = ["| each row keeps what the rows above have | scenes | success (%) | change | median steps |",
+             "| --- | --- | --- | --- | --- |"]
     before: Results | None = None
     for name, results in found:
         row, change = rows(results.records)[-1], ""
         if before is not None:
-            paired = mean([100.0 * (a["success"] - b["success"])
-                           for a, b in zip(results.records, before.records, strict=True)])
+            earlier = {record["scene"]: record["success"] for record in before.records}
+            paired = mean([100.0 * (record["success"] - earlier[record["scene"]])
+                           for record in results.records if record["scene"] in earlier])
             change = f"{paired.value:+.1f} ± {paired.standard_error or 0.0:.1f}"
         share = row.success
         told = f"{100 * share.value:.1f} ({100 * share.low:.1f} to {100 * share.high:.1f})"
-        lines.append(f"| {name} | {told} | {change} | {row.median_steps:g} |")
+        lines.append(f"| {name} | {row.scenes} | {told} | {change} | {row.median_steps:g} |")
         before = results
     return "\n".join(lines) + "\n"
 

@@ -2,6 +2,7 @@
 
 import io
 import json
+from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
@@ -9,6 +10,8 @@ from rich.console import Console
 from saccade.app.bench import comparison
 from saccade.app.bench.comparison import cells, compare
 from saccade.app.bench.table import PAPER_AGENTS, PAPER_ROOM
+from saccade.benchmarks.from_paper import STEPS, value_of, page
+from saccade.shared.config import Config, load
 from saccade.shared.errors import SaccadeError
 
 AGENTS = ("random-walk", "still")
@@ -52,3 +55,25 @@ def test_every_agent_of_the_paper_has_its_rows(tmp_path):
         cells(tmp_path, "ycb", ["oracle"])
     with pytest.raises(SaccadeError, match="'nobody' is unknown"):
         cells(tmp_path, "ycb", ["nobody"])
+
+
+# --- from the paper's agent to ours
+
+def test_the_steps_lead_from_the_papers_agent_to_ours_and_each_changes_something():
+    ours, config = Config().model_dump(mode="json"), load(None, "paper")
+    for name, keys in STEPS[1:]:
+        after = config.with_values({key: value_of(ours, key) for key in keys})
+        assert after != config, name
+        config = after
+    assert config == Config()
+
+
+def test_the_change_of_a_step_is_over_the_scenes_that_both_rows_have():
+    def row(successes):
+        return SimpleNamespace(records=[{
+            "scene": str(n), "target": "can", "success": success, "steps": 9, "declared": False, "declared_true": False,
+            "azimuth_error_rad": 0.1, "elevation_error_rad": 0.1, "range_error_m": 0.1}
+            for n, success in enumerate(successes)])
+
+    last = page([("before", row([True, False, True, True])), ("after", row([True, True]))]).splitlines()[-1]
+    assert last == "| after | 2 | 100.0 (34.2 to 100.0) | +50.0 ± 50.0 | 9 |"
