@@ -10,7 +10,7 @@ from rich.console import Console
 from saccade.app.bench import comparison
 from saccade.app.bench.comparison import cells, compare
 from saccade.app.bench.table import PAPER_AGENTS, PAPER_ROOM
-from saccade.benchmarks.from_paper import STEPS, value_of, page
+from saccade.benchmarks.from_paper import STEPS, page, value_of
 from saccade.shared.config import Config, load
 from saccade.shared.errors import SaccadeError
 
