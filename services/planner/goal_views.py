@@ -7,19 +7,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from saccade.services.planner.place import Ground
 from saccade.shared.world.geometry import Array, spherical
 from saccade.shared.world.symmetry import CONTINUOUS, NONE, about_vertical, turned_about, turns_of
-from saccade.shared.world.task import SUCCESS_TRANSLATION_M, Spheres, clip
 
 
-def nearest_eye(eye: Array, center: Array, symmetry: int, camera: Array, spheres: Spheres) -> Array:
+def nearest_eye(eye: Array, center: Array, symmetry: int, camera: Array, ground: Ground) -> Array:
     """The position [3] from which a target at `center` [3] looks as it does from `eye` [3] that is the nearest to the
     camera's pose [4, 4]. Positions that the camera cannot come near to are taken only if there are no others."""
     if symmetry == NONE:
         return eye
     eyes = center + about_vertical(turns_of(symmetry)) @ (eye - center)
-    is_blocked = np.linalg.norm(clip(eyes, spheres) - eyes, axis=1) > SUCCESS_TRANSLATION_M
-    nearest_first = np.lexsort([np.linalg.norm(eyes - camera[:3, 3], axis=1), is_blocked])
+    nearest_first = np.lexsort([np.linalg.norm(eyes - camera[:3, 3], axis=1), ground.is_blocked(eyes)])
     return np.asarray(eyes[nearest_first[0]])
 
 
