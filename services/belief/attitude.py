@@ -1,5 +1,5 @@
-"""How an object in any pose is turned, from percepts that tell rotations, and how a camera must be turned to see it as in
-the goal image.
+"""How an object in any pose is turned, from percepts that tell rotations, and how a camera must be turned to see it as
+in the goal image.
 
 It is a posterior over rotations world_from_object: those of an object that stands upright (see `turn.py`), and those of
 a grid over all rotations. Both count as equally likely before the first view. An upright one has far fewer to choose

@@ -11,13 +11,12 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from saccade.services.planner.candidates import draw, peak
+from saccade.services.planner.candidates import draw
 from saccade.services.planner.declaring import UNLIKELY, Evidence, Rivals, fused_here
 from saccade.services.planner.free_energy import Terms, expected_free_energy
-from saccade.services.planner.goal import Preference, aim, infer_preference
-from saccade.services.planner.goal_views import Side, nearest_eye
+from saccade.services.planner.goal import Preference, infer_preference
+from saccade.services.planner.goal_views import Side, goal_eye, goal_viewpoint, heading
 from saccade.services.planner.hand import Hand
 from saccade.services.planner.place import NEARER, Ground, PaperGround, Room
 from saccade.shared.bus.messages import Action, Belief, Plan
@@ -100,8 +99,7 @@ class Planner:
             if self.hand is not None:
                 chosen = self.plan = replace(chosen, viewpoint=self.hand.follow(chosen.viewpoint, spheres, eye))
         self.before = camera
-        heading = self._heading(camera, chosen, beliefs)
-        translation, rotation = ground.step(camera, heading, self.config.planner.step_m)
+        translation, rotation = ground.step(camera, self._heading(camera, chosen, beliefs), self.config.planner.step_m)
         if declared:  # the agent is judged at the pose at which it says that it has arrived, so it must not move
             translation, rotation = np.zeros(3), np.zeros(3)
         distance = -1.0 if eye is None else float(np.linalg.norm(eye - camera[:3, 3]))
@@ -118,7 +116,7 @@ class Planner:
         target = beliefs[self.preference.target]
         if target.goal_range_m > 0:
             self.preference = replace(self.preference, range_m=target.goal_range_m)
-        told = ground.told(target, self.preference.range_m, np.asarray(self.sizes_m[target.object]))
+        told = ground.told(target, self.preference, np.asarray(self.sizes_m[target.object]))
         return beliefs | {target.object: told}
 
     def _moved(self, chosen: Plan | None, mode: str, beliefs: dict[str, Belief], camera: Array,
@@ -189,9 +187,8 @@ class Planner:
         if np.linalg.norm(plan.viewpoint[:3, 3] - camera[:3, 3]) < TURN_M:
             return plan.viewpoint
         gaze = plan.look_at_m if plan.mode == "search" else beliefs[plan.target].mean_m
-        heading = look_at(camera[:3, 3], gaze)
-        heading[:3, 3] = plan.viewpoint[:3, 3]
-        return heading
+        rolled = plan.mode == "goal" and beliefs[plan.target].goal_rotations is not None
+        return heading(camera, plan.viewpoint, gaze, rolled=rolled)
 
     def obstacles(self, beliefs: dict[str, Belief]) -> Spheres:
         """Spheres around the objects whose presence and position the agent is sure of."""
@@ -222,10 +219,10 @@ class Planner:
         rng = generator(self.config.seed, self.config.bus.world, self.episode, stamp.step, "planner")
         found, best = self.preference if mode != "search" else None, None
         eyes, gazes = draw(beliefs, self.preference, self._doubt, self.config.planner.candidates, ground, rng)
-        if found is not None and (log_posterior := beliefs[found.target].goal_log_posterior) is not None:
+        believed = self._believed_eye(beliefs, camera, ground)
+        if found is not None and believed is not None:
             target = beliefs[found.target]
-            eye = self._goal_eye(target, log_posterior, found.range_m, camera, ground) if self.wanted is None \
-                else target.mean_m + found.range_m * self.wanted
+            eye = believed if self.wanted is None else target.mean_m + found.range_m * self.wanted
             best, side = self._goal_viewpoint(found, target, eye), self._side(target, eye)
             eyes, gazes = np.vstack([side.eyes(eyes), best[:3, 3]]), np.vstack([gazes, target.mean_m])
         eyes = ground.within(eyes)
@@ -271,27 +268,15 @@ class Planner:
             cost += VISITED_COST * np.exp(-0.5 * (far + turned))
         return cost
 
-    def _goal_eye(self, target: Belief, log_posterior: NDArray[np.float32], range_m: float, camera: Array,
-                  ground: Ground) -> Array:
-        eye = peak(target.mean_m, log_posterior, range_m)
-        return nearest_eye(eye, target.mean_m, self.symmetry[target.object], camera, ground)
-
     def _believed_eye(self, beliefs: dict[str, Belief], camera: Array, ground: Ground) -> Array | None:
         """Where the goal's view is believed to be [3]. None if nothing is known of it."""
-        target = beliefs[self.preference.target] if self.preference is not None else None
-        if self.preference is None or target is None or target.goal_log_posterior is None:
+        if self.preference is None:
             return None
-        return self._goal_eye(target, target.goal_log_posterior, self.preference.range_m, camera, ground)
+        target = beliefs[self.preference.target]
+        return goal_eye(target, self.preference, self.symmetry[target.object], camera, ground)
 
     def _goal_viewpoint(self, preference: Preference, target: Belief, eye: Array) -> Array:
-        """The camera pose [4, 4] at `eye` [3] that shows the target at the pixel where the goal image shows it.
-
-        With `planner.goal_pixel=false` it looks straight at the target. As in the environment, a position that the
-        camera may not enter is clipped only when the camera moves there, and the attitude is kept.
-        """
-        if not self.config.planner.goal_pixel:
-            return look_at(eye, target.mean_m)
-        return aim(eye, target.mean_m, preference.pixel, preference.intrinsics_px)
+        return goal_viewpoint(target, preference, eye, goal_pixel=self.config.planner.goal_pixel)
 
     def _plan(self, stamp: Belief, mode: str, viewpoint: Array, gaze: Array, terms: Terms, chosen: int) -> Plan:
         return Plan(

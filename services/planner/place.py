@@ -13,6 +13,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
+from saccade.services.planner.goal import Preference
 from saccade.services.planner.motion import along, step_towards, turn_towards
 from saccade.shared.bus.messages import Belief
 from saccade.shared.world.geometry import Array, direction, viewing_grid
@@ -51,7 +52,7 @@ class Ground(Protocol):
     def best(self, cost: Array, eyes: Array, camera: Array) -> int:
         """The number of the position with the least cost [N] that a camera [4, 4] can reach."""
 
-    def told(self, target: Belief, range_m: float, size_m: Array) -> Belief:
+    def told(self, target: Belief, preference: Preference, size_m: Array) -> Belief:
         """A belief about the target, which has a size [3], with what the place says of where its goal image was taken
         from."""
 
@@ -83,7 +84,7 @@ class PaperGround:
     def best(self, cost: Array, eyes: Array, camera: Array) -> int:
         return int(np.argmin(cost))
 
-    def told(self, target: Belief, range_m: float, size_m: Array) -> Belief:
+    def told(self, target: Belief, preference: Preference, size_m: Array) -> Belief:
         return target
 
     def step(self, camera: Array, heading: Array, step_m: float) -> tuple[Array, Array]:
@@ -135,19 +136,29 @@ class Room:
         total = cost + longer
         return int(np.argmin(total)) if np.isfinite(total).any() else first
 
-    def told(self, target: Belief, range_m: float, size_m: Array) -> Belief:
+    def told(self, target: Belief, preference: Preference, size_m: Array) -> Belief:
         """The goal's camera was where the camera may be, and saw the target."""
         if target.goal_log_posterior is None:
             return target
         elevation, azimuth = viewing_grid()
         away = direction(azimuth, elevation[:, None]).reshape(-1, 3)
-        eyes = target.mean_m + range_m * away
-        hidden = self.place.hides(eyes[:, None], target.mean_m + _PARTS * size_m).mean(1)
-        unlikely = self.is_blocked(eyes) | (hidden > 1.0 - SEEN)
+        unlikely = self._cannot_be(target.mean_m, preference.range_m * away, size_m)
         posterior = target.goal_log_posterior - UNLIKELY_NATS * unlikely.reshape(target.goal_log_posterior.shape)
         fine = posterior.astype(np.float64)
         fine -= fine.max()
-        return replace(target, goal_log_posterior=(fine - np.log(np.exp(fine).sum())).astype(np.float32))
+        target = replace(target, goal_log_posterior=(fine - np.log(np.exp(fine).sum())).astype(np.float32))
+        if target.goal_rotations is None or target.goal_rotations_log_probability is None:
+            return target
+        away = -(target.goal_rotations @ preference.ray)
+        unlikely = self._cannot_be(target.mean_m, preference.range_m * away, size_m)
+        return replace(target, goal_rotations_log_probability=target.goal_rotations_log_probability
+                       - UNLIKELY_NATS * unlikely)
+
+    def _cannot_be(self, center: Array, away_m: Array, size_m: Array) -> NDArray[np.bool_]:
+        """Whether cameras at `away_m` [N, 3] from a target at `center` [3] cannot be there, or see too little of it."""
+        eyes = center + away_m
+        hidden = self.place.hides(eyes[:, None], center + _PARTS * size_m).mean(1)
+        return np.asarray(self.is_blocked(eyes) | (hidden > 1.0 - SEEN))
 
     def step(self, camera: Array, heading: Array, step_m: float) -> tuple[Array, Array]:
         here, there = self.nearest(camera[:3, 3]), self.nearest(heading[:3, 3])

@@ -18,8 +18,8 @@ def alike(eye: Array, center: Array, symmetry: int, *, rolled: bool = False) -> 
     direction says nothing of how an image is rotated."""
     rows, columns = viewing_grid()
     elevations, azimuths = np.meshgrid(rows, columns, indexing="ij")
-    return np.any([_near(eye, center, elevations, azimuths, equal, rolled) for equal in turns_of(symmetry, len(columns))],
-                  axis=0)
+    return np.any([_near(eye, center, elevations, azimuths, equal, rolled)
+                   for equal in turns_of(symmetry, len(columns))], axis=0)
 
 
 def _near(eye: Array, center: Array, elevations: Array, azimuths: Array, equal_rad: float,

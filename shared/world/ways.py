@@ -71,7 +71,8 @@ class Ways:
                                                       min_only=True, return_predecessors=True)
 
     def lengths_m(self, ends: ArrayLike) -> Array:
-        """About how long the ways to positions [N, 3] are, in metres. Infinite where none is found."""
+        """About how long the ways to positions [N, 3] are, in metres: at most _JOIN_M too short, because that is how
+        far the lattice may begin from the start. Infinite where none is found."""
         reached = np.flatnonzero(np.isfinite(self._lengths))
         if not len(reached):
             return np.full(len(np.asarray(ends)), np.inf)
