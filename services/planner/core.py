@@ -18,7 +18,7 @@ from saccade.services.planner.free_energy import Terms, expected_free_energy
 from saccade.services.planner.goal import Preference, infer_preference
 from saccade.services.planner.goal_views import Side, goal_eye, goal_viewpoint, heading
 from saccade.services.planner.hand import Hand
-from saccade.services.planner.place import NEARER, Ground, PaperGround, Room
+from saccade.services.planner.place import Ground, PaperGround, Room, way_cost
 from saccade.shared.bus.messages import Action, Belief, Plan
 from saccade.shared.bus.topics import ACTION, BELIEF, GOAL, GOAL_PERCEPT, PLAN, Output
 from saccade.shared.config import Config
@@ -231,7 +231,7 @@ class Planner:
             cost = (terms.pose + terms.scale) / self._doubt + terms.position + terms.information
             cost = cost + self._visited_cost(eyes, self._side(beliefs[found.target], eyes[-1]))
         else:  # of equally informative viewpoints the nearest is taken
-            cost = terms.total + NEARER * np.linalg.norm(eyes - camera[:3, 3], axis=1)
+            cost = terms.total + way_cost(eyes, camera)
         cost = cost + ground.hidden_cost(eyes, gazes)
         chosen = ground.best(cost, eyes, camera) if self.wanted is None or best is None else len(eyes) - 1
         if found is None or best is None:

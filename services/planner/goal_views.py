@@ -12,7 +12,7 @@ import numpy as np
 
 from saccade.services.planner.candidates import peak
 from saccade.services.planner.goal import Preference, aim, turned_onto
-from saccade.services.planner.place import UNLIKELY_NATS, Ground
+from saccade.services.planner.place import Ground
 from saccade.shared.bus.messages import Belief
 from saccade.shared.world.geometry import Array, look_at, pose, spherical, unit
 from saccade.shared.world.symmetry import CONTINUOUS, NONE, about_vertical, turned_about, turns_of
@@ -36,8 +36,7 @@ def goal_eye(target: Belief, preference: Preference, symmetry: int, camera: Arra
         eye = peak(target.mean_m, target.goal_log_posterior, preference.range_m)
         return nearest_eye(eye, target.mean_m, symmetry, camera, ground)
     eyes = target.mean_m - preference.range_m * (target.goal_rotations @ preference.ray)
-    log_probability = np.asarray(target.goal_rotations_log_probability)
-    return np.asarray(eyes[np.argmax(log_probability - UNLIKELY_NATS * ground.is_blocked(eyes))])
+    return np.asarray(eyes[np.argmax(np.asarray(target.goal_rotations_log_probability))])
 
 
 def goal_viewpoint(target: Belief, preference: Preference, eye: Array, *, goal_pixel: bool) -> Array:

@@ -31,6 +31,11 @@ UNLIKELY_NATS = 8.0  # chosen: by which a direction is less likely from which th
 SEEN = 0.25  # chosen: share of these parts that is seen in a view that may be the goal's
 
 
+def way_cost(eyes: Array, camera: Array) -> Array:
+    """Cost [N] (nats) of the straight ways from a camera [4, 4] to positions [N, 3]."""
+    return np.asarray(NEARER * np.linalg.norm(eyes - camera[:3, 3], axis=1))
+
+
 class Ground(Protocol):
     """What the planner asks. Positions are in metres, in the world."""
 
