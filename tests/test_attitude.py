@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from saccade.services.belief.attitude import GRID, PoseLikeness, hypotheses, rotation_grid
+from saccade.services.belief.attitude import GRID, PoseLikeness, _angles, hypotheses, rotation_grid
 from saccade.services.belief.pose import GoalView
 from saccade.shared.bus.messages import Percept
 from saccade.shared.config import BeliefConfig
@@ -60,6 +60,11 @@ def test_the_grid_leaves_no_rotation_far_from_its_own():
     assert 0.04 < apart.mean() < 0.15
     np.testing.assert_allclose(np.einsum("nij,nkj->nik", grid[::500], grid[::500]), np.tile(np.eye(3), (24, 1, 1)),
                                atol=1e-12)
+
+
+def test_angles_by_one_product_are_those_of_the_geometry():
+    a, b = rotation_grid(7), rotation_grid(5)
+    np.testing.assert_allclose(_angles(a, b), rotation_angle(a[:, None], b[None]), atol=1e-6)
 
 
 @pytest.mark.parametrize("now", [STANDING, LYING, ON_ITS_HEAD])

@@ -224,6 +224,14 @@ def test_all_ways_from_a_place_tell_what_cannot_be_reached():
     assert ways.to([[-0.3, 0.2, TOP_M + 0.3]]) is None
 
 
+def test_wrong_beliefs_that_leave_no_room_stop_nothing():
+    """An object that is believed to fill the whole place."""
+    full = room(Boxes(np.zeros((1, 3)), np.eye(3)[None], np.full((1, 3), 9.0)))
+    np.testing.assert_array_equal(full.nearest(np.array([0.1, 0.9, 0.3])), [0.1, 0.7, 0.3])
+    move, _ = full.step(START, look_at([0.3, 0.0, 0.2], CENTER), 0.05)
+    assert np.linalg.norm(move) == pytest.approx(0.05)
+
+
 # --- rolled goals
 
 ROLLED = look_at(CENTER + 0.35 * direction(2.0, 0.7), CENTER)[:3, :3] @ yaw_rotation(2.2)

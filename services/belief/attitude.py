@@ -29,7 +29,7 @@ OUTLIER = 0.05  # chosen: probability that what a view says of the rotation is w
 BELL_RAD = 0.1  # chosen: what is added to the deviation of a percept, so that no rotation falls through the grid
 DIRECTION_RAD = 0.1  # chosen: the same for the directions of the goal's camera
 EQUAL_TURNS = 24  # that stand for all turns of an object which looks the same from all around
-PAIRS = 400  # chosen: so many of the likeliest pairs of a rotation and a mode of the goal's percept are looked at
+PAIRS = 200  # chosen: so many of the likeliest pairs of a rotation and a mode of the goal's percept are looked at
 AROUND_RAD = 0.35  # chosen: rotations within this angle are told as one, by their mean
 MOST_VIEWS = 6  # chosen: rotations of the goal's camera that are told
 LEAST = 0.01  # chosen: a rotation of the goal's camera with a lower probability is not told
@@ -88,9 +88,7 @@ class PoseLikeness:
         deviation = np.hypot(percept.deviation_rad, BELL_RAD)
         share = np.zeros(len(rotations))
         for weight, equal, std in zip(np.exp(percept.log_probability), told, deviation, strict=True):
-            cosine = (rotations.reshape(-1, 9) @ equal.reshape(-1, 9).T - 1.0) / 2.0
-            angle = np.arccos(np.clip(cosine, -1.0, 1.0))
-            share += weight / std ** 3 * np.exp(-0.5 * (angle / std) ** 2).sum(1)
+            share += weight / std ** 3 * np.exp(-0.5 * (_angles(rotations, equal) / std) ** 2).sum(1)
         return np.log((1 - OUTLIER) * share / max(float(prior @ share), 1e-12) + OUTLIER)
 
     def grid(self, log_probability: Array) -> Array:
@@ -98,9 +96,9 @@ class PoseLikeness:
         rotations, weights, deviation = self._pairs(log_probability)
         elevation, azimuth = viewing_grid()
         cells = direction(azimuth, elevation[:, None])
-        apart = np.arccos(np.clip(cells.reshape(-1, 3) @ -(rotations @ self.ray).T, -1.0, 1.0))
-        # Cells near the pole are smaller.
-        share = (np.exp(-0.5 * (apart / deviation) ** 2) / deviation ** 2) @ weights
+        cosine = cells.reshape(-1, 3) @ -(rotations @ self.ray).T
+        # The normal distribution on a sphere (Fisher, 1953). Cells near the pole are smaller.
+        share = np.exp((cosine - 1.0) / deviation ** 2) @ (weights / deviation ** 2)
         share = share.reshape(cells.shape[:2]) * np.cos(elevation)[:, None] + 1e-9
         return np.log(share / share.sum())
 
@@ -108,7 +106,7 @@ class PoseLikeness:
         """How the goal's camera was turned: peaks, each the mean of what is around it."""
         rotations, weights, _ = self._pairs(log_probability)
         left, means, shares = weights.copy(), list[Array](), list[float]()
-        near = rotation_angle(rotations[:, None], rotations[None]) < AROUND_RAD
+        near = _angles(rotations, rotations) < AROUND_RAD
         while len(means) < MOST_VIEWS:
             mass = near @ left
             peak = int(np.argmax(mass))
@@ -133,3 +131,8 @@ class PoseLikeness:
         which, mode = best[likeliest // len(self.weights)], likeliest % len(self.weights)
         chosen = joint[likeliest]
         return rotations[which] @ self.object_from_camera[mode], chosen / chosen.sum(), self.deviation_rad[mode]
+
+
+def _angles(a: Array, b: Array) -> Array:
+    """Angles [N, M] between rotations [N, 3, 3] and [M, 3, 3], as `rotation_angle` gives them, by one product."""
+    return np.asarray(np.arccos(np.clip((a.reshape(-1, 9) @ b.reshape(-1, 9).T - 1.0) / 2.0, -1.0, 1.0)))

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from saccade.services.planner.goal import Preference
 from saccade.services.planner.motion import along, step_towards, turn_towards
 from saccade.shared.bus.messages import Belief
+from saccade.shared.errors import SaccadeError
 from saccade.shared.world.geometry import Array, direction, viewing_grid
 from saccade.shared.world.place import Place
 from saccade.shared.world.task import LOWER_M, SUCCESS_TRANSLATION_M, UPPER_M, Spheres, clip
@@ -116,7 +117,10 @@ class Room:
         return self.place.reach.nearest(eyes)
 
     def nearest(self, eye: Array) -> Array:
-        return self.space.nearest(eye)
+        try:
+            return self.space.nearest(eye)
+        except SaccadeError:  # objects that are believed to be everywhere are not
+            return self.place.reach.nearest(eye)
 
     def is_blocked(self, eyes: Array) -> NDArray[np.bool_]:
         gaps = np.linalg.norm(self.place.reach.nearest(eyes) - eyes, axis=1)
