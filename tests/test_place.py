@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from saccade.services.belief.core import build as build_belief
 from saccade.services.belief.position import PositionFilter
 from saccade.services.planner.core import build
 from saccade.services.planner.goal import Preference, turned_onto
@@ -18,6 +19,7 @@ from saccade.shared.world.geometry import (
     INTRINSICS_PX,
     direction,
     look_at,
+    pose,
     project,
     rotation_angle,
     rotation_xyz,
@@ -34,6 +36,7 @@ STAMP = {"run": "r", "episode": 0}
 NAME, TOP_M = "soup_can", -0.15
 CENTER = np.array([0.0, 0.0, TOP_M + 0.05])
 START = look_at([0.6, 0.0, TOP_M + 0.3], CENTER)
+ROLLED = look_at(CENTER + 0.35 * direction(2.0, 0.7), CENTER)[:3, :3] @ yaw_rotation(2.2)
 WALL = {"obstacle_centers_m": np.array([[0.3, 0.0, TOP_M + 0.2]]), "obstacle_sizes_m": np.array([[0.02, 0.8, 0.4]]),
         "obstacle_yaws_rad": np.zeros(1)}
 
@@ -61,6 +64,16 @@ def belief(step=0, camera=START, towards=(0.0, 0.6), found=True, **more) -> Beli
                   particles_m=cloud.astype(np.float32), views=3,
                   goal_log_posterior=(-0.5 * apart ** 2).astype(np.float32) if found else None,
                   goal_range_m=0.35 if found else 0.0, goal_here=0.0, **more)
+
+
+def percept_of(camera, world_from_object, step=0) -> Percept:
+    """What a camera sees of the can in this pose."""
+    seen, nothing = np.linalg.inv(camera) @ world_from_object, np.zeros(0, np.float32)
+    return Percept(**STAMP, step=step, object=NAME, presence=0.99, pixel=project(CENTER, camera, INTRINSICS_PX)[0],
+                   pixel_std=2.0, scale=0.4 / np.linalg.norm(CENTER - camera[:3, 3]), log_scale_std=0.03,
+                   latent_mean=nothing, latent_std=nothing, intrinsics_px=np.array(INTRINSICS_PX),
+                   world_from_camera=camera, camera_from_object=seen, rotations=seen[None, :3, :3],
+                   log_probability=np.zeros(1), deviation_rad=np.full(1, 0.05))
 
 
 def goal_percept() -> Percept:
@@ -131,6 +144,29 @@ def test_without_a_place_the_cloud_is_that_of_the_paper():
         [-0.5, -0.5, 0.0], [0.5, 0.5, 0.5], (500, 3)))
 
 
+@pytest.mark.parametrize("place", [True, False])
+def test_the_belief_service_takes_the_place_from_the_goal(place):
+    """In a place the can lies on a table that is lower than the paper's, and its goal was rolled. Without one, nothing
+    is below the paper's table, and nothing is rolled."""
+    lies = pose(rotation_xyz((np.pi / 2, 0.0, 0.4)), CENTER)
+    filter_ = build_belief(Config().with_values({"scene.names": [NAME]}))
+    filter_.begin("r", 0)
+    wanted = pose(ROLLED, CENTER + 0.35 * direction(2.0, 0.7))
+    inputs = {"goal": told() if place else told(workspace_m=None), "goal_percept": {NAME: percept_of(wanted, lies)}}
+    for step in range(3):
+        camera = look_at(CENTER + 0.5 * direction(0.3 * step, 0.6), CENTER)
+        inputs["percept"] = {NAME: percept_of(camera, lies, step)}
+        (output,) = filter_.step(inputs)
+    known: Belief = output.message
+    if not place:
+        assert known.mean_m[2] > 0.0
+        assert known.goal_rotations is None
+        return
+    np.testing.assert_allclose(known.mean_m, CENTER, atol=0.02)
+    assert rotation_angle(known.goal_rotations[0], ROLLED) < 0.1
+    assert known.goal_log_posterior is not None
+
+
 # --- candidates
 
 def test_the_best_viewpoint_is_one_that_can_be_reached():
@@ -190,7 +226,7 @@ def test_the_agent_goes_around_a_wall_and_through_nothing():
     for before, after in pairwise(poses):
         assert space.free(before[:3, 3], after[:3, 3])
     there = CENTER + 0.35 * direction(np.pi, 0.5)
-    assert min(np.linalg.norm(pose[:3, 3] - there) for pose in poses) < 0.02
+    assert min(np.linalg.norm(each[:3, 3] - there) for each in poses) < 0.02
     assert not space.free(START[:3, 3], there)
     assert {plan.mode for plan in plans} == {"goal"}
 
@@ -208,9 +244,9 @@ def test_the_agent_looks_for_the_target_behind_the_wall_where_it_cannot_see():
 def test_a_believed_object_is_gone_around():
     """The can is between the start and the goal's view on its other side."""
     plans, poses = journey(told(), lambda step, camera: belief(step, camera, (np.pi, 0.1)), 40)
-    nearest = min(np.linalg.norm(pose[:2, 3] - CENTER[:2]) for pose in poses if pose[2, 3] < CENTER[2] + 0.1)
+    nearest = min(np.linalg.norm(each[:2, 3] - CENTER[:2]) for each in poses if each[2, 3] < CENTER[2] + 0.1)
     assert nearest > CLEARANCE_M
-    assert min(np.linalg.norm(pose[:3, 3] - plans[0].viewpoint[:3, 3]) for pose in poses) < 0.02
+    assert min(np.linalg.norm(each[:3, 3] - plans[0].viewpoint[:3, 3]) for each in poses) < 0.02
 
 
 def test_all_ways_from_a_place_tell_what_cannot_be_reached():
@@ -233,9 +269,6 @@ def test_wrong_beliefs_that_leave_no_room_stop_nothing():
 
 
 # --- rolled goals
-
-ROLLED = look_at(CENTER + 0.35 * direction(2.0, 0.7), CENTER)[:3, :3] @ yaw_rotation(2.2)
-
 
 def lying(**more) -> Belief:
     return belief(towards=(2.0, 0.7), goal_rotations=np.array([ROLLED, rotation_xyz((0.3, 0.2, 0.1))]),
@@ -274,5 +307,5 @@ def test_a_camera_is_turned_onto_any_direction(towards):
 def test_the_agent_arrives_rolled():
     _, poses = journey(told(), lambda step, camera: lying(step=step, camera=camera), 40)
     there = CENTER + 0.35 * direction(2.0, 0.7)
-    arrived = [pose for pose in poses if np.linalg.norm(pose[:3, 3] - there) < 0.02]
-    assert min(rotation_angle(pose[:3, :3], ROLLED) for pose in arrived) < 0.06
+    arrived = [each for each in poses if np.linalg.norm(each[:3, 3] - there) < 0.02]
+    assert min(rotation_angle(each[:3, :3], ROLLED) for each in arrived) < 0.06
