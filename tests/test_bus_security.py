@@ -89,8 +89,8 @@ SAYS = {"simulator": {"frame", "goal", "truth"}, "camera": {"frame", "goal"}, "p
         "director": set(), "viewer": set()}
 SEEN = {"frame", "goal", "percept", "belief", "plan", "truth", "result", "status"}
 HEARS = {"simulator": {"action", "result", "status"}, "camera": {"action", "status"},
-         "perception": {"frame", "goal", "percept", "goal_percept"}, "belief": {"percept", "goal_percept"},
-         "planner": {"belief", "goal_percept"}, "evaluator": {"truth"}, "recorder": set(TOPICS), "viewer": SEEN,
+         "perception": {"frame", "goal", "percept", "goal_percept"}, "belief": {"percept", "goal_percept", "goal"},
+         "planner": {"belief", "goal_percept", "goal"}, "evaluator": {"truth"}, "recorder": set(TOPICS), "viewer": SEEN,
          "director": {"frame", "truth", "plan", "belief", "status", "result"}}
 ROUTER = """
 import sys, time

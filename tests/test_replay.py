@@ -26,8 +26,8 @@ from saccade.shared.log.recording import RunLog
 from saccade.tests.fixtures.make import CONFIG, GOLDEN, IN_WORDS, WORDS, changes, in_words
 from saccade.tests.samples import sample
 
-FORMAT_1, FORMAT_2, FORMAT_3, FORMAT_4, FORMAT_5 = OLDER = tuple(
-    GOLDEN.with_name(f"format_{number}.mcap") for number in (1, 2, 3, 4, 5))
+FORMAT_1, FORMAT_2, FORMAT_3, FORMAT_4, FORMAT_5, FORMAT_6 = OLDER = tuple(
+    GOLDEN.with_name(f"format_{number}.mcap") for number in (1, 2, 3, 4, 5, 6))
 WAIT_S = 300
 
 
@@ -95,6 +95,12 @@ def test_a_log_without_places_and_instances_tells_a_scene_of_the_paper():
     assert {(t.target_instance, t.instances, t.events) for t in truths} == {(1, None, None)}
     assert truths[0].labels() == truths[0].names
     assert not changes(FORMAT_5, GOLDEN)
+
+
+def test_a_belief_without_rolled_goals_is_one_of_an_upright_world():
+    """Format 6: beliefs lacked them. All that was in it is as it was."""
+    assert {b.goal_rotations is None for t, _, b in RunReader(FORMAT_6) if t == BELIEF} == {True}
+    assert not changes(FORMAT_6, GOLDEN)
 
 
 def test_on_the_bus_as_in_one_process_nothing_is_lost(tmp_path):

@@ -10,6 +10,7 @@ from saccade.services.belief.turn import TURNS, turn_probability
 from saccade.services.evaluator.core import result_of
 from saccade.services.planner.goal_views import Side, nearest_eye
 from saccade.services.planner.oracle import Oracle
+from saccade.services.planner.place import PaperGround
 from saccade.services.simulator.core import Simulator
 from saccade.services.simulator.scenes import Placed, Scene
 from saccade.shared.errors import SaccadeError
@@ -191,13 +192,13 @@ def test_the_belief_shows_all_views_that_look_like_the_goal_and_knows_when_it_is
 
 def test_the_agent_goes_to_the_nearest_view_that_looks_like_the_goal_and_is_free():
     there, camera = CENTER + 0.3 * direction(np.pi * 0.9, 0.6), camera_at(0.0)
-    assert nearest_eye(there, CENTER, NONE, camera, NOTHING) is there
+    assert nearest_eye(there, CENTER, NONE, camera, PaperGround(NOTHING)) is there
     near = CENTER + 0.3 * direction(-np.pi * 0.1, 0.6)
-    assert nearest_eye(there, CENTER, 2, camera, NOTHING) == pytest.approx(near)
-    assert nearest_eye(there, CENTER, CONTINUOUS, camera, NOTHING) == pytest.approx(
+    assert nearest_eye(there, CENTER, 2, camera, PaperGround(NOTHING)) == pytest.approx(near)
+    assert nearest_eye(there, CENTER, CONTINUOUS, camera, PaperGround(NOTHING)) == pytest.approx(
         CENTER + 0.3 * direction(0.0, 0.6), abs=0.01)
     blocking = Spheres(near[None], np.array([0.12]))
-    assert nearest_eye(there, CENTER, 2, camera, blocking) == pytest.approx(there)
+    assert nearest_eye(there, CENTER, 2, camera, PaperGround(blocking)) == pytest.approx(there)
 
 
 @pytest.mark.parametrize(("symmetry", "most"), [(2, np.pi / 2), (4, np.pi / 4), (CONTINUOUS, 0.0)])

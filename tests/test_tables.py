@@ -213,6 +213,18 @@ def test_the_environment_draws_scenes_of_a_suite(suite):
         env.close()
 
 
+def test_a_camera_may_be_farther_away_than_in_the_paper():
+    """A shell that an arm reaches ends more than a metre from the middle of the table."""
+    env = gymnasium.make(ID, names=("soup_can", "rice_box"), suite="anywhere", size_px=48)
+    farthest = 0.0
+    for seed in range(8):
+        observation, _ = env.reset(seed=seed)
+        assert env.observation_space.contains(observation)
+        farthest = max(farthest, float(np.abs(observation["pose"][:3, 3]).max()))
+    assert farthest > 1.0
+    env.close()
+
+
 def test_the_environment_says_what_suites_there_are():
     with pytest.raises(SaccadeError, match="suite 'none' is unknown: choose from paper-500"):
         gymnasium.make(ID, suite="none")

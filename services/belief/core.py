@@ -8,19 +8,21 @@ from typing import TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
+from saccade.services.belief.attitude import PoseLikeness, Views
 from saccade.services.belief.free_energy import crop_term, identity_term, likelihood_term, pose_term, position_term
 from saccade.services.belief.pose import GoalView, LatentLikeness, Likeness, TurnLikeness
 from saccade.services.belief.position import PositionFilter, evidence_of
 from saccade.shared.bus.messages import Belief, Percept
-from saccade.shared.bus.topics import BELIEF, GOAL_PERCEPT, PERCEPT, Output
+from saccade.shared.bus.topics import BELIEF, GOAL, GOAL_PERCEPT, PERCEPT, Output
 from saccade.shared.config import Config
 from saccade.shared.loop.seeding import generator
 from saccade.shared.loop.service import Inputs, Service
 from saccade.shared.model.latent import LatentTransition
 from saccade.shared.model.object_card import symmetries
 from saccade.shared.model.weights import WITH_LATENTS, Weights
+from saccade.shared.world.place import Place, place_of
 
-SERVICE = Service("belief", inputs=(PERCEPT, GOAL_PERCEPT), trigger=PERCEPT, outputs=(BELIEF,))
+SERVICE = Service("belief", inputs=(PERCEPT, GOAL_PERCEPT, GOAL), trigger=PERCEPT, outputs=(BELIEF,))
 
 Moments = tuple[NDArray[np.float64], NDArray[np.float64]]  # mean [3], covariance [3, 3]
 
@@ -56,8 +58,7 @@ class BeliefFilter:
     def begin(self, run: str, episode: int) -> Iterable[Output]:
         """Starts an episode. Nothing is known about its scene yet, and nothing is published."""
         self.episode = episode
-        self.positions = {name: PositionFilter(self.config.belief, self._rng(0, f"start {name}"))
-                          for name in self.names}
+        self.positions: dict[str, PositionFilter] = {}
         self.goal_views: dict[str, GoalView] = {}
         self.last_seen: dict[str, Percept] = {}
         self.goal_known = False
@@ -70,17 +71,22 @@ class BeliefFilter:
         """Yields one belief per object, computed from the percepts of all objects at one step."""
         percepts: dict[str, Percept] = inputs["percept"]
         if not self.goal_known:
-            self.goal_known = True
+            self.goal_known, place = True, place_of(inputs.get("goal"))
+            self.positions = {name: PositionFilter(self.config.belief, self._rng(0, f"start {name}"), place)
+                              for name in self.names}
             self.goal_views = {
                 name: GoalView(self.config.belief, likeness, goal, self.symmetry[name])
                 for name, goal in inputs["goal_percept"].items() if goal.presence > WORTH_COMPARING
-                for likeness in self._likeness(goal)}
+                for likeness in self._likeness(goal, place)}
         present = {name for name in self.names if percepts[name].presence > self.config.belief.present_above}
         for name in self.names:
             yield Output(BELIEF, self._update(name, percepts, present), name)
 
-    def _likeness(self, goal: Percept) -> list[Likeness]:
-        """How views of an object are compared with its percept in the goal image. Empty if they cannot be."""
+    def _likeness(self, goal: Percept, place: Place | None) -> list[Likeness]:
+        """How views of an object are compared with its percept in the goal image. Empty if they cannot be. In a place
+        of its own an object may lie, and the goal's camera may have been rolled."""
+        if goal.rotations is not None and place is not None:
+            return [PoseLikeness(goal, self.symmetry[goal.object])]
         if goal.rotations is not None:
             return [TurnLikeness(goal, self.symmetry[goal.object])]
         direct = self.config.belief.pose != "last"  # the paper's agent has the transition alone
@@ -113,7 +119,7 @@ class BeliefFilter:
             particles_m=position.sample(self.config.belief.published_particles, rng).astype(np.float32),
             views=len(goal_view.keyframes) if goal_view else 0,
             goal_log_posterior=None if posterior is None else posterior.astype(np.float32),
-            goal_range_m=goal_range_m, goal_here=goal_here, **energy)
+            goal_range_m=goal_range_m, goal_here=goal_here, **_told(goal_view.views if goal_view else None), **energy)
 
     def _free_energy(self, percept: Percept, prior: float, before: Moments, after: Moments,
                      present: bool) -> Energy:
@@ -132,6 +138,19 @@ class BeliefFilter:
         if len(percept.latent_mean):
             terms["f_pose"] = pose_term(percept, last, after[0], self.transitions[name])
         return terms
+
+
+class ToldViews(TypedDict, total=False):
+    """The fields of `Belief` about how the goal's camera was turned."""
+
+    goal_rotations: NDArray[np.float64]
+    goal_rotations_log_probability: NDArray[np.float64]
+
+
+def _told(views: Views | None) -> ToldViews:
+    if views is None:
+        return {}
+    return {"goal_rotations": views.rotations, "goal_rotations_log_probability": views.log_probability}
 
 
 def build(config: Config) -> BeliefFilter:

@@ -5,7 +5,8 @@ latent pose of the view to every cell. A cell is as likely as the goal's latent 
 equations 2 and 5). A view from about the same direction is also compared with the goal's directly, which tells apart
 sides that look alike. The likelihoods of views from different places are multiplied. For a nearly symmetric object the
 posterior may have several modes; new views decide between them. Percepts that tell rotations in place of a latent pose
-are fused over the turn of the object (`services/belief/turn.py`).
+are fused over the turn of the object (`services/belief/turn.py`), or over all its rotations where it may lie
+(`services/belief/attitude.py`).
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from saccade.services.belief.attitude import Views
 from saccade.services.belief.turn import GoalDirections, turn_probability
 from saccade.shared.bus.messages import Percept
 from saccade.shared.config import BeliefConfig
@@ -60,6 +62,9 @@ class Likeness(Protocol):
 
     def grid(self, log_probability: Array) -> Array:
         """Log probabilities of the directions of the viewing grid [E, A], from fused ones of that something."""
+
+    def views(self, log_probability: Array) -> Views | None:
+        """How the goal's camera was turned, from the same. None if it was not rolled, so that its direction says it."""
 
 
 class LatentLikeness:
@@ -110,6 +115,10 @@ class LatentLikeness:
         """The same, because it is over the grid already."""
         return log_probability
 
+    def views(self, log_probability: Array) -> Views | None:
+        """None: nothing is known of a roll."""
+        return None
+
 
 class TurnLikeness:
     """The likeness by rotations, over the turn of the object, which may be symmetric, about the vertical."""
@@ -124,6 +133,10 @@ class TurnLikeness:
     def grid(self, log_probability: Array) -> Array:
         """Log probabilities of the directions of the grid [E, A]."""
         return np.log(self.directions.of(np.exp(log_probability)))
+
+    def views(self, log_probability: Array) -> Views | None:
+        """None: an object that stands upright was seen by a camera that was."""
+        return None
 
 
 @dataclass(eq=False)
@@ -155,6 +168,7 @@ class GoalView:
         elevation, azimuth = viewing_grid()
         self.elevation, self.azimuth = (x.ravel() for x in np.meshgrid(elevation, azimuth, indexing="ij"))
         self.keyframes: list[Keyframe] = []
+        self.views: Views | None = None  # how the goal's camera was turned, with the last posterior
         self.center = np.full(3, np.inf)  # last believed position of the object; none yet
 
     def seen(self, percept: Percept, center: Array) -> None:
@@ -185,7 +199,7 @@ class GoalView:
         last = self.keyframes[-1]
         alone = last.log_likelihood if last.percept is percept else self.likeness.of(percept, self.center)
         share = np.exp(self.likeness.grid(alone)).ravel()
-        return float(share[alike(eye, self.center, self.symmetry).ravel()].sum())
+        return float(share[alike(eye, self.center, self.symmetry, rolled=self.views is not None).ravel()].sum())
 
     def log_posterior(self) -> Array | None:
         """Log probabilities of the directions of the grid, normalised [E, A]. None before the first view.
@@ -194,16 +208,18 @@ class GoalView:
         """
         if not self.keyframes:
             return None
-        first = self._fuse(np.ones(len(self.keyframes)))
-        return self._fuse(1.0 + NEAR_WEIGHT * self._nearness(first))
+        first = self._fused(np.ones(len(self.keyframes)))
+        fused = self._fused(1.0 + NEAR_WEIGHT * self._nearness(self.likeness.grid(first)))
+        self.views = self.likeness.views(fused)
+        return self.likeness.grid(fused)
 
-    def _fuse(self, weights: Array) -> Array:
+    def _fused(self, weights: Array) -> Array:
         # Views are not independent, and they share the error of the goal's percept: together they count as a few views.
         worth = min(self.config.view_worth, self.config.views_worth / weights.sum())
         # The prior is uniform in azimuth and elevation, because goals are drawn like this (paper, section 4.1).
         total = np.asarray(worth * sum(w * k.log_likelihood for w, k in zip(weights, self.keyframes, strict=True)))
         total -= total.max()
-        return self.likeness.grid(total - np.log(np.exp(total).sum()))
+        return np.asarray(total - np.log(np.exp(total).sum()))
 
     def _nearness(self, log_posterior: Array) -> Array:
         """How near each kept view is to the likeliest direction, from 0 to 1 for the same direction [views]."""

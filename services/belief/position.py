@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from saccade.shared.bus.messages import Percept
 from saccade.shared.config import BeliefConfig
 from saccade.shared.world.geometry import IMAGE_SIZE_PX, REFERENCE_RANGE_M, pixel_rays, project
+from saccade.shared.world.place import Place
 
 Array = NDArray[np.float64]
 
 WORKSPACE_M = np.array([[-0.5, 0.5], [-0.5, 0.5], [0.0, 0.5]])
-VOLUME_M3 = float(np.prod(WORKSPACE_M[:, 1] - WORKSPACE_M[:, 0]))
 MODEL_STD_M = 0.006  # chosen: deviation of the box's centre from the centre of what is seen, which no network can know
 # Variances across and along the ray (paper, appendix D), with the values of the published code.
 PAPER_ACROSS_M2, PAPER_ALONG_M2 = 0.020, 0.0969
@@ -73,11 +73,16 @@ def _global_state(rng: np.random.Generator) -> Iterator[None]:
 
 
 class PositionFilter:
-    """A particle filter over the position of one object: particles [N, 3] (m, world) and weights [N]."""
+    """A particle filter over the position of one object: particles [N, 3] (m, world) and weights [N].
 
-    def __init__(self, config: BeliefConfig, rng: np.random.Generator):
-        self.config = config
-        self.particles = rng.uniform(WORKSPACE_M[:, 0], WORKSPACE_M[:, 1], (config.particles, 3))
+    In a `place` that the goal message tells, objects are on its table, and its walls hide them.
+    """
+
+    def __init__(self, config: BeliefConfig, rng: np.random.Generator, place: Place | None = None):
+        self.config, self.place = config, place
+        self.extent_m = WORKSPACE_M if place is None else place.extent_m(WORKSPACE_M)
+        self.volume_m3 = float(np.prod(self.extent_m[:, 1] - self.extent_m[:, 0]))
+        self.particles = rng.uniform(self.extent_m[:, 0], self.extent_m[:, 1], (config.particles, 3))
         self.weights = np.full(config.particles, 1.0 / config.particles)
         self.log_odds = 0.0  # log odds that the object is in the scene
 
@@ -100,23 +105,24 @@ class PositionFilter:
         share = max(born, FRESH_SHARE) if born else 0.0
         fresh = rng.permutation(len(self.particles))[:int(share * len(self.particles))]
         drawn = evidence.mean + rng.standard_normal((len(fresh), 3)) @ factor.T
-        inside = np.all((drawn > WORKSPACE_M[:, 0]) & (drawn < WORKSPACE_M[:, 1]), axis=1)
+        inside = np.all((drawn > self.extent_m[:, 0]) & (drawn < self.extent_m[:, 1]), axis=1)
         self.particles[fresh] = np.where(inside[:, None], drawn, self.particles[fresh])
-        likelihood = (1 - born) * (_density(self.particles, evidence, factor) + OUTLIER / VOLUME_M3)
+        likelihood = (1 - born) * (_density(self.particles, evidence, factor) + OUTLIER / self.volume_m3)
         # The fresh particles were drawn from the percept itself, so their share of the posterior is known.
         self.weights[fresh] = 1.0
-        likelihood[fresh] = np.where(inside, born / VOLUME_M3 / max(len(fresh), 1), 0.0)
+        likelihood[fresh] = np.where(inside, born / self.volume_m3 / max(len(fresh), 1), 0.0)
         self._reweigh(likelihood, rng)
         odds = percept.presence / max(1.0 - percept.presence, 1e-3)
         self.log_odds = min(self.log_odds + np.log(max(odds, 1e-3)), MOST_LOG_ODDS)
 
     def visible(self, camera: Array, intrinsics_px: Array, others: list[tuple[Evidence, float]]) -> NDArray[np.bool_]:
-        """Which particles [N] are inside the image and not hidden by one of the `others`.
+        """Which particles [N] are inside the image and not hidden by one of the `others` or by a wall.
 
         `camera` is world_from_camera [4, 4]. `others` are the other objects that are seen, with their radii (m).
         """
         hide = behind if self.config.hidden == "outlines" else beyond_nearest
-        return in_view(self.particles, camera, intrinsics_px) & ~hide(self.particles, camera[:3, 3], others)
+        visible = in_view(self.particles, camera, intrinsics_px) & ~hide(self.particles, camera[:3, 3], others)
+        return visible if self.place is None else visible & ~self.place.hides(camera[:3, 3], self.particles)
 
     def expected(self, visible: NDArray[np.bool_]) -> float:
         """Probability that the object is seen in a view in which the particles `visible` [N] are visible."""
@@ -139,7 +145,7 @@ class PositionFilter:
             with _global_state(rng):
                 chosen = systematic_resample(self.weights)
             noise = rng.normal(0.0, self.config.jitter_m, self.particles.shape)
-            self.particles = np.clip(self.particles[chosen] + noise, WORKSPACE_M[:, 0], WORKSPACE_M[:, 1])
+            self.particles = np.clip(self.particles[chosen] + noise, self.extent_m[:, 0], self.extent_m[:, 1])
             self.weights = np.full(len(weights), 1.0 / len(weights))
 
     def moments(self) -> tuple[Array, Array]:

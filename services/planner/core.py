@@ -11,55 +11,41 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from saccade.services.planner.candidates import draw
 from saccade.services.planner.declaring import UNLIKELY, Evidence, Rivals, fused_here
 from saccade.services.planner.free_energy import Terms, expected_free_energy
-from saccade.services.planner.goal import Preference, aim, infer_preference
-from saccade.services.planner.goal_views import Side, nearest_eye
+from saccade.services.planner.goal import Preference, infer_preference
+from saccade.services.planner.goal_views import Side, goal_eye, goal_viewpoint, heading
 from saccade.services.planner.hand import Hand
-from saccade.services.planner.motion import step_towards
+from saccade.services.planner.place import Ground, PaperGround, Room, way_cost
 from saccade.shared.bus.messages import Action, Belief, Plan
-from saccade.shared.bus.topics import ACTION, BELIEF, GOAL_PERCEPT, PLAN, Output
+from saccade.shared.bus.topics import ACTION, BELIEF, GOAL, GOAL_PERCEPT, PLAN, Output
 from saccade.shared.config import Config
 from saccade.shared.loop.seeding import generator
 from saccade.shared.loop.service import Inputs, Service
 from saccade.shared.model.object_card import symmetries
 from saccade.shared.model.weights import Weights
-from saccade.shared.world.geometry import (
-    Array,
-    direction,
-    look_at,
-    rotation_angle,
-    rotation_towards,
-    unit,
-    viewing_grid,
-    wrap,
-)
+from saccade.shared.world.geometry import Array, look_at, rotation_angle, rotation_towards
+from saccade.shared.world.place import place_of
 from saccade.shared.world.symmetry import NONE
-from saccade.shared.world.task import LOWER_M, UPPER_M, Spheres, clip, spheres_around, success
+from saccade.shared.world.task import Spheres, spheres_around, success
+from saccade.shared.world.workspace import Boxes
 
-SERVICE = Service("planner", inputs=(BELIEF, GOAL_PERCEPT), trigger=BELIEF, outputs=(PLAN, ACTION))
+SERVICE = Service("planner", inputs=(BELIEF, GOAL_PERCEPT, GOAL), trigger=BELIEF, outputs=(PLAN, ACTION))
 
 PRESENT = 0.5  # derived: an object counts as present if this is likelier than not
-NEAREST_GOAL_M = 0.1  # chosen: no candidate is nearer to the target than this
 FOUND_M = 0.06  # chosen: the target counts as found if the deviation of its position is below this
 KNOWN_M = 0.10  # chosen: an object becomes an obstacle if the deviation of its position is below this
 ARRIVED_M = 0.01  # chosen: the camera has arrived if it is within this distance of its viewpoint and within ARRIVED_RAD
 ARRIVED_RAD = 0.05  # chosen: the camera has arrived if it is within this angle of its viewpoint and within ARRIVED_M
 STUCK_M = 0.002  # chosen: a camera that moves less than this in a step counts as arrived, because it cannot come nearer
 TURN_M = 0.10  # chosen: nearer than this to its viewpoint the camera turns as planned; before, it looks at the target
-NEARER = 0.3  # chosen: nats per metre of distance, so that the nearest of equally informative viewpoints is taken
-SPREAD_M = 0.10  # from the published code: standard deviation of the candidates' ranges around the goal's range
-CELL_RAD = 0.045  # derived: half a cell of the viewing grid; a candidate's direction is drawn within its cell
-SPREAD = 0.02  # chosen: relative standard deviation of the range of candidates that are drawn from the goal posterior
 VISITED_M = 0.05  # chosen: viewpoints within about this distance of one that was not the goal's also become costly
 VISITED_RAD = 0.35  # chosen: viewpoints within about this angle of one that was not the goal's also become costly
 VISITED_COST = 6.0  # chosen: nats that are added to the cost of a viewpoint that was not the goal's
 DOUBT_LIMIT = 2.5  # chosen: after wrong viewpoints the goal's log posterior is divided by at most this
 SURE_ALONE = 0.6  # chosen: without second thoughts the agent says so above this probability by the present view
-PEAK_ROWS = 2  # chosen: the posterior's peak is averaged over this many cells of elevation on each side
-PEAK_COLUMNS = 4  # chosen: the posterior's peak is averaged over this many cells of azimuth on each side
 PUBLISHED = 64  # number of candidates in a plan message; it changes nothing that the agent does
 
 
@@ -94,24 +80,26 @@ class Planner:
         camera = stamp.world_from_camera
         if not self.goal_known:
             self.goal_known = True
+            place = place_of(inputs.get("goal"))
+            self.room = None if place is None else Room(place)
             preference = infer_preference(inputs["goal_percept"], self.config.planner.range_std_m)
             self.confidence = preference.confidence
             # A goal image that shows no known object sets no preference. The agent then explores.
             known = preference.confidence >= self.config.planner.goal_confidence
             self.preference = preference if known and not self.config.scene.explore else None
-        self._refine(beliefs)
-        self._note_rivals(beliefs)
         spheres = self.obstacles(beliefs)
-        chosen, mode, eye = self.plan, self._mode(beliefs), self._believed_eye(beliefs, camera, spheres)
+        ground = PaperGround(spheres) if self.room is None else self.room.among(self._boxes(beliefs))
+        beliefs = self._refine(beliefs, ground)
+        self._note_rivals(beliefs)
+        chosen, mode, eye = self.plan, self._mode(beliefs), self._believed_eye(beliefs, camera, ground)
         moved = self._moved if self.hand is None else self._followed
         due, declared = moved(chosen, mode, beliefs, camera, eye)
         if chosen is None or due:
-            chosen = self.plan = self._choose(stamp, mode, beliefs, camera, spheres)
+            chosen = self.plan = self._choose(stamp, mode, beliefs, camera, ground)
             if self.hand is not None:
                 chosen = self.plan = replace(chosen, viewpoint=self.hand.follow(chosen.viewpoint, spheres, eye))
         self.before = camera
-        heading = self._heading(camera, chosen, beliefs)
-        translation, rotation = step_towards(camera, heading, spheres, self.config.planner.step_m)
+        translation, rotation = ground.step(camera, self._heading(camera, chosen, beliefs), self.config.planner.step_m)
         if declared:  # the agent is judged at the pose at which it says that it has arrived, so it must not move
             translation, rotation = np.zeros(3), np.zeros(3)
         distance = -1.0 if eye is None else float(np.linalg.norm(eye - camera[:3, 3]))
@@ -120,10 +108,16 @@ class Planner:
         yield Output(ACTION, Action(run=plan.run, episode=plan.episode, step=plan.step, translation_m=translation,
                                     rotation_rad=rotation, arrived=declared))
 
-    def _refine(self, beliefs: dict[str, Belief]) -> None:
-        """Takes the goal's range from the belief, which corrects it by the error that similar views have."""
-        if self.preference and beliefs[self.preference.target].goal_range_m > 0:
-            self.preference = replace(self.preference, range_m=beliefs[self.preference.target].goal_range_m)
+    def _refine(self, beliefs: dict[str, Belief], ground: Ground) -> dict[str, Belief]:
+        """Takes the goal's range from the belief, which corrects it by the error that similar views have. Returns the
+        beliefs with what the place says of the goal's view."""
+        if self.preference is None:
+            return beliefs
+        target = beliefs[self.preference.target]
+        if target.goal_range_m > 0:
+            self.preference = replace(self.preference, range_m=target.goal_range_m)
+        told = ground.told(target, self.preference, np.asarray(self.sizes_m[target.object]))
+        return beliefs | {target.object: told}
 
     def _moved(self, chosen: Plan | None, mode: str, beliefs: dict[str, Belief], camera: Array,
                eye: Array | None) -> tuple[bool, bool]:
@@ -193,15 +187,21 @@ class Planner:
         if np.linalg.norm(plan.viewpoint[:3, 3] - camera[:3, 3]) < TURN_M:
             return plan.viewpoint
         gaze = plan.look_at_m if plan.mode == "search" else beliefs[plan.target].mean_m
-        heading = look_at(camera[:3, 3], gaze)
-        heading[:3, 3] = plan.viewpoint[:3, 3]
-        return heading
+        rolled = plan.mode == "goal" and beliefs[plan.target].goal_rotations is not None
+        return heading(camera, plan.viewpoint, gaze, rolled=rolled)
 
     def obstacles(self, beliefs: dict[str, Belief]) -> Spheres:
         """Spheres around the objects whose presence and position the agent is sure of."""
-        known = [b for b in beliefs.values() if b.presence > PRESENT and np.trace(b.covariance_m2) < KNOWN_M ** 2]
+        known = _known(beliefs)
         return spheres_around(np.array([b.mean_m for b in known]).reshape(-1, 3),
                               np.array([self.sizes_m[b.object] for b in known]).reshape(-1, 3))
+
+    def _boxes(self, beliefs: dict[str, Belief]) -> Boxes:
+        """Boxes around the same objects. They are as wide to all sides, because it is not known how they are turned."""
+        known = _known(beliefs)
+        sizes = np.array([self.sizes_m[b.object] for b in known], dtype=np.float64).reshape(-1, 3)
+        sizes[:, :2] = sizes[:, :2].mean(1, keepdims=True)
+        return Boxes(np.array([b.mean_m for b in known]).reshape(-1, 3), np.tile(np.eye(3), (len(known), 1, 1)), sizes)
 
     def _mode(self, beliefs: dict[str, Belief]) -> str:
         """The mode of the plan.
@@ -214,27 +214,28 @@ class Planner:
             return "search"
         return "approach" if target.goal_log_posterior is None else "goal"
 
-    def _choose(self, stamp: Belief, mode: str, beliefs: dict[str, Belief], camera: Array, spheres: Spheres) -> Plan:
+    def _choose(self, stamp: Belief, mode: str, beliefs: dict[str, Belief], camera: Array, ground: Ground) -> Plan:
         """Draws candidate viewpoints, computes their cost and returns the plan with the best one."""
         rng = generator(self.config.seed, self.config.bus.world, self.episode, stamp.step, "planner")
         found, best = self.preference if mode != "search" else None, None
-        eyes, gazes = self._candidates(beliefs, rng)
-        if found is not None and (log_posterior := beliefs[found.target].goal_log_posterior) is not None:
+        eyes, gazes = draw(beliefs, self.preference, self._doubt, self.config.planner.candidates, ground, rng)
+        believed = self._believed_eye(beliefs, camera, ground)
+        if found is not None and believed is not None:
             target = beliefs[found.target]
-            eye = self._goal_eye(target, log_posterior, found.range_m, camera, spheres) if self.wanted is None \
-                else target.mean_m + found.range_m * self.wanted
+            eye = believed if self.wanted is None else target.mean_m + found.range_m * self.wanted
             best, side = self._goal_viewpoint(found, target, eye), self._side(target, eye)
             eyes, gazes = np.vstack([side.eyes(eyes), best[:3, 3]]), np.vstack([gazes, target.mean_m])
-        eyes = np.clip(eyes, LOWER_M, UPPER_M)
+        eyes = ground.within(eyes)
         terms = expected_free_energy(eyes, gazes, beliefs, found, self.config.planner.information_weight)
         if found is not None:  # after each wrong viewpoint, pose and scale are trusted less, so others are tried
             cost = (terms.pose + terms.scale) / self._doubt + terms.position + terms.information
             cost = cost + self._visited_cost(eyes, self._side(beliefs[found.target], eyes[-1]))
         else:  # of equally informative viewpoints the nearest is taken
-            cost = terms.total + NEARER * np.linalg.norm(eyes - camera[:3, 3], axis=1)
-        chosen = int(np.argmin(cost)) if self.wanted is None or best is None else len(eyes) - 1
+            cost = terms.total + way_cost(eyes, camera)
+        cost = cost + ground.hidden_cost(eyes, gazes)
+        chosen = ground.best(cost, eyes, camera) if self.wanted is None or best is None else len(eyes) - 1
         if found is None or best is None:
-            viewpoint = look_at(clip(eyes[chosen], spheres), gazes[chosen])
+            viewpoint = look_at(ground.nearest(eyes[chosen]), gazes[chosen])
         elif chosen == len(eyes) - 1:
             viewpoint = best
         else:
@@ -252,34 +253,6 @@ class Planner:
         """
         return min(1.0 + len(self.visited), DOUBT_LIMIT)
 
-    def _candidates(self, beliefs: dict[str, Belief], rng: np.random.Generator) -> tuple[Array, Array]:
-        """Draws the positions and the look-at points of N candidates, each [N, 3] (m, world).
-
-        A third of the positions is drawn from the posterior over the goal's direction, a third at the goal's range, and
-        a third anywhere. The look-at points are drawn from the particles.
-        """
-        count, preference = self.config.planner.candidates, self.preference
-        watched = [beliefs[preference.target]] if preference is not None else list(beliefs.values())
-        clouds = np.concatenate([belief.particles_m for belief in watched]).astype(np.float64)
-        gazes = clouds[rng.integers(len(clouds), size=count)]
-        eyes = rng.uniform(LOWER_M, UPPER_M, (count, 3))
-        if preference is None:
-            return eyes, gazes
-        third, doubt, target = count // 3, self._doubt, beliefs[preference.target]
-        reach = preference.range_m + rng.normal(0, SPREAD_M, third)
-        away = unit(eyes[third:2 * third] - gazes[third:2 * third])
-        eyes[third:2 * third] = gazes[third:2 * third] + np.maximum(reach, NEAREST_GOAL_M)[:, None] * away
-        if target.goal_log_posterior is not None:
-            probabilities = np.exp(target.goal_log_posterior.astype(np.float64) / doubt).ravel()
-            cells = rng.choice(len(probabilities), size=third, p=probabilities / probabilities.sum())
-            elevation, azimuth = viewing_grid()
-            e, a = elevation[cells // len(azimuth)], azimuth[cells % len(azimuth)]
-            away = direction(a + rng.uniform(-CELL_RAD, CELL_RAD, third), e + rng.uniform(-CELL_RAD, CELL_RAD, third))
-            reach = preference.range_m * np.exp(rng.normal(0, SPREAD * doubt, third))
-            gazes[:third] = target.mean_m
-            eyes[:third] = gazes[:third] + reach[:, None] * away
-        return eyes, gazes
-
     def _side(self, target: Belief, eye: Array) -> Side:
         return Side(target.mean_m, self.symmetry[target.object], eye)
 
@@ -295,27 +268,15 @@ class Planner:
             cost += VISITED_COST * np.exp(-0.5 * (far + turned))
         return cost
 
-    def _goal_eye(self, target: Belief, log_posterior: NDArray[np.float32], range_m: float, camera: Array,
-                  spheres: Spheres) -> Array:
-        eye = _peak(target.mean_m, log_posterior, range_m)
-        return nearest_eye(eye, target.mean_m, self.symmetry[target.object], camera, spheres)
-
-    def _believed_eye(self, beliefs: dict[str, Belief], camera: Array, spheres: Spheres) -> Array | None:
+    def _believed_eye(self, beliefs: dict[str, Belief], camera: Array, ground: Ground) -> Array | None:
         """Where the goal's view is believed to be [3]. None if nothing is known of it."""
-        target = beliefs[self.preference.target] if self.preference is not None else None
-        if self.preference is None or target is None or target.goal_log_posterior is None:
+        if self.preference is None:
             return None
-        return self._goal_eye(target, target.goal_log_posterior, self.preference.range_m, camera, spheres)
+        target = beliefs[self.preference.target]
+        return goal_eye(target, self.preference, self.symmetry[target.object], camera, ground)
 
     def _goal_viewpoint(self, preference: Preference, target: Belief, eye: Array) -> Array:
-        """The camera pose [4, 4] at `eye` [3] that shows the target at the pixel where the goal image shows it.
-
-        With `planner.goal_pixel=false` it looks straight at the target. As in the environment, a position that the
-        camera may not enter is clipped only when the camera moves there, and the attitude is kept.
-        """
-        if not self.config.planner.goal_pixel:
-            return look_at(eye, target.mean_m)
-        return aim(eye, target.mean_m, preference.pixel, preference.intrinsics_px)
+        return goal_viewpoint(target, preference, eye, goal_pixel=self.config.planner.goal_pixel)
 
     def _plan(self, stamp: Belief, mode: str, viewpoint: Array, gaze: Array, terms: Terms, chosen: int) -> Plan:
         return Plan(
@@ -327,22 +288,9 @@ class Planner:
             arrived=False)
 
 
-def _peak(center: Array, log_posterior: NDArray[np.float32], range_m: float) -> Array:
-    """The camera position [3] at the goal's range in the direction of the posterior's peak.
-
-    The peak is averaged over its neighbours in the grid. Azimuth and elevation are averaged separately, because near
-    the pole two positions may be neighbours although their images are rotated by half a turn.
-    """
-    elevation, azimuth = viewing_grid()
-    fine = log_posterior.astype(np.float64)
-    row, column = map(int, np.unravel_index(np.argmax(fine), fine.shape))
-    rows = np.arange(max(row - PEAK_ROWS, 0), min(row + PEAK_ROWS + 1, len(elevation)))
-    columns = np.arange(column - PEAK_COLUMNS, column + PEAK_COLUMNS + 1) % len(azimuth)
-    mass = np.exp(fine[np.ix_(rows, columns)] - fine[row, column])
-    mass /= mass.sum()
-    mean_azimuth = azimuth[column] + (mass * wrap(azimuth[columns] - azimuth[column])).sum()
-    mean_elevation = (mass * elevation[rows][:, None]).sum()
-    return center + range_m * direction(mean_azimuth, mean_elevation)
+def _known(beliefs: dict[str, Belief]) -> list[Belief]:
+    """The beliefs about objects whose presence and position the agent is sure of."""
+    return [b for b in beliefs.values() if b.presence > PRESENT and np.trace(b.covariance_m2) < KNOWN_M ** 2]
 
 
 def _between(a: Array, b: Array) -> tuple[float, float]:

@@ -55,8 +55,8 @@ def fused_here(target: Belief, camera: Array, symmetry: int) -> float:
     posterior."""
     if target.goal_log_posterior is None:
         return 0.0
-    share = np.exp(target.goal_log_posterior.astype(np.float64))
-    return float(share[alike(camera[:3, 3], target.mean_m, symmetry)].sum() / share.sum())
+    share, rolled = np.exp(target.goal_log_posterior.astype(np.float64)), target.goal_rotations is not None
+    return float(share[alike(camera[:3, 3], target.mean_m, symmetry, rolled=rolled)].sum() / share.sum())
 
 
 class Rivals:

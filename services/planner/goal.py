@@ -10,6 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 from saccade.shared.bus.messages import Percept
 from saccade.shared.world.geometry import REFERENCE_RANGE_M, Array, look_at, pixel_rays, pose, unit
 
+OPPOSITE = -0.99  # cosine of an angle from which on the smallest turn is not well defined
+
 
 @dataclass(frozen=True)
 class Preference:
@@ -24,6 +26,11 @@ class Preference:
     pixel: NDArray[np.float64]
     intrinsics_px: NDArray[np.float64]
     confidence: float  # probability that the target is in the goal image
+
+    @property
+    def ray(self) -> Array:
+        """The direction [3] of the target in the frame of the goal's camera."""
+        return pixel_rays(self.pixel, self.intrinsics_px)
 
 
 def infer_preference(percepts: dict[str, Percept], range_std_m: float) -> Preference:
@@ -57,3 +64,15 @@ def aim(position: ArrayLike, target: ArrayLike, pixel: ArrayLike, intrinsics_px:
     heading = np.arctan2(towards[1], towards[0]) - np.arctan2(seen[1], seen[0])
     turn = np.array([[np.cos(heading), -np.sin(heading), 0.0], [np.sin(heading), np.cos(heading), 0.0], [0, 0, 1.0]])
     return pose(turn @ rotation, position)
+
+
+def turned_onto(rotation: ArrayLike, ray: ArrayLike, towards: ArrayLike) -> Array:
+    """A rotation world_from_camera [3, 3], turned as little as possible so that its `ray` [3] (camera's frame) points
+    `towards` [3] (world)."""
+    rotation = np.asarray(rotation, dtype=np.float64)
+    here, there = rotation @ np.asarray(ray), np.asarray(towards)
+    axis, cosine = np.cross(here, there), float(here @ there)
+    if cosine < OPPOSITE:  # about the image's own vertical, as one who looks behind
+        return turned_onto(rotation @ np.diag([-1.0, 1.0, -1.0]), ray, towards)
+    cross = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
+    return (np.eye(3) + cross + cross @ cross / (1.0 + cosine)) @ rotation

@@ -7,12 +7,12 @@ from itertools import pairwise
 import numpy as np
 
 from saccade.services.planner.motion import STEP_M, along, step_towards, turn_towards
-from saccade.services.planner.place import space_of
 from saccade.shared.bus.messages import Action, Goal, Truth
 from saccade.shared.bus.topics import ACTION, GOAL, TRUTH, Output
 from saccade.shared.config import Config
 from saccade.shared.loop.service import Inputs, Service
 from saccade.shared.world.geometry import Array, pose
+from saccade.shared.world.place import place_of
 from saccade.shared.world.task import SUCCESS_TRANSLATION_M, Spheres, apply_action, clip, success
 from saccade.shared.world.ways import find_way
 from saccade.shared.world.workspace import Boxes, Space
@@ -97,10 +97,11 @@ class Oracle:
 
 def known_space(goal: Goal, truth: Truth) -> Space | None:
     """What the camera may do among the true objects. None if the rule of the paper holds."""
-    if truth.sizes_m is None:
+    place = place_of(goal)
+    if truth.sizes_m is None or place is None:
         return None
-    return space_of(goal, Boxes(np.asarray(truth.centers_m), np.asarray(truth.world_from_objects()),
-                                np.asarray(truth.sizes_m)))
+    return place.space(Boxes(np.asarray(truth.centers_m), np.asarray(truth.world_from_objects()),
+                             np.asarray(truth.sizes_m)))
 
 
 def build(config: Config) -> Oracle:

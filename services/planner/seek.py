@@ -7,11 +7,11 @@ from collections.abc import Iterable
 
 from saccade.services.planner.core import Planner
 from saccade.services.planner.follow import Follower
-from saccade.shared.bus.topics import ACTION, BELIEF, GOAL_PERCEPT, PERCEPT, PLAN, Output
+from saccade.shared.bus.topics import ACTION, BELIEF, GOAL, GOAL_PERCEPT, PERCEPT, PLAN, Output
 from saccade.shared.config import Config
 from saccade.shared.loop.service import Inputs, Service
 
-SERVICE = Service("planner", inputs=(BELIEF, PERCEPT, GOAL_PERCEPT), trigger=BELIEF, outputs=(PLAN, ACTION))
+SERVICE = Service("planner", inputs=(BELIEF, PERCEPT, GOAL_PERCEPT, GOAL), trigger=BELIEF, outputs=(PLAN, ACTION))
 
 
 class Seeker:

@@ -28,6 +28,7 @@ from saccade.shared.world.geometry import IMAGE_SIZE_PX, INTRINSICS_PX
 from saccade.shared.world.task import ACTION_LIMIT, MAX_STEPS, errors
 
 ID = "saccade/ActiveSearch-v0"
+FARTHEST_M = 10.0  # of a camera from the middle of the table, along each axis, in a workspace of its own
 Observation = dict[str, Any]  # name -> array
 
 
@@ -54,8 +55,11 @@ class ActiveSearch(gymnasium.Env[Observation, NDArray[np.float64]]):
                  scenes: str | Path | None = None, suite: str | None = None,
                  max_steps: int = MAX_STEPS, size_px: int = IMAGE_SIZE_PX, render_mode: str | None = None):
         image = spaces.Box(0, 255, (size_px, size_px, 3), np.uint8)
+        farthest = np.ones((4, 4))
+        if suite in TABLES or scenes is not None:  # a workspace may be larger than the paper's
+            farthest[:3, 3] = FARTHEST_M
         self.observation_space = spaces.Dict(
-            {"image": image, "goal": image, "pose": spaces.Box(-1.0, 1.0, (4, 4), np.float64)})
+            {"image": image, "goal": image, "pose": spaces.Box(-farthest, farthest, dtype=np.float64)})
         self.action_space = spaces.Box(-ACTION_LIMIT, ACTION_LIMIT, (6,), np.float64)
         self.render_mode, self.yaw, self.n_objects, self.max_steps = render_mode, yaw, n_objects, max_steps
         in_use = names_in_use(SceneConfig(objects=objects, names=tuple(names) if names is not None else None))

@@ -145,6 +145,8 @@ class Percept(Message):
 class Belief(Message):
     """The posterior over one object: where it is, and from where it would look like the goal."""
 
+    VERSION: ClassVar[int] = 2
+
     object: str
     """Name of the object."""
     presence: float
@@ -166,6 +168,11 @@ class Belief(Message):
     """Range at which the goal image shows the object, by the measure of similar views. 0 without a posterior."""
     goal_here: float = 0.0
     """Probability, by the present view alone, that the goal image was taken from about this direction."""
+    goal_rotations: Annotated[np.ndarray, array("f8", "G", 3, 3)] | None = None
+    """Rotations world_from_camera from which the object looks as in the goal image, the likeliest first. They are there
+    if the object may lie and the goal's camera may have been rolled; otherwise the direction says it."""
+    goal_rotations_log_probability: Annotated[np.ndarray, array("f8", "G")] | None = None
+    """Their log probabilities."""
     f_pose: float = 0.0
     """Term of the variational free energy (paper, appendix A), nats: the latent pose."""
     f_identity: float = 0.0

@@ -78,8 +78,18 @@ def with_places_and_instances() -> Change:
     return change
 
 
+def with_rolled_goals() -> Change:
+    """Format 6 to 7: a belief may tell how the goal's camera was rolled."""
+    def change(topic: Topic, part: str | None, fields: Fields) -> Fields:
+        if topic.type is not m.Belief:
+            return fields
+        return fields | {"version": 2} | dict.fromkeys(("goal_rotations", "goal_rotations_log_probability"))
+
+    return change
+
+
 CHANGES: tuple[Callable[[], Change], ...] = (count_in_episodes, with_masks_and_candidates, with_poses,
-                                             with_several_rotations, with_places_and_instances)
+                                             with_several_rotations, with_places_and_instances, with_rolled_goals)
 FORMAT = OLDEST + len(CHANGES)
 
 

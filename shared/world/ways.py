@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
+from scipy.spatial import cKDTree
 
 from saccade.shared.world.geometry import Array
 from saccade.shared.world.workspace import ShellReach, Space
@@ -56,6 +57,49 @@ def lattice_of(space: Space) -> Lattice:
     return Lattice(points, graph)
 
 
+class Ways:
+    """Short ways from one allowed position [3] to all others over the lattice of a space."""
+
+    def __init__(self, space: Space, start: ArrayLike) -> None:
+        self.space, self.start, self.lattice = space, np.asarray(start, dtype=np.float64), lattice_of(space)
+        points = self.lattice.points_m
+        joined = _joined(space, self.lattice, self.start)
+        self._lengths, self._before = np.full(len(points), np.inf), np.full(len(points), -1)
+        if len(joined):
+            first = joined[np.argsort(np.linalg.norm(points[joined] - self.start, axis=1))]
+            self._lengths, self._before, _ = dijkstra(self.lattice.lengths_m, directed=False, indices=first,
+                                                      min_only=True, return_predecessors=True)
+
+    def lengths_m(self, ends: ArrayLike) -> Array:
+        """About how long the ways to positions [N, 3] are, in metres: at most _JOIN_M too short, because that is how
+        far the lattice may begin from the start. Infinite where none is found."""
+        reached = np.flatnonzero(np.isfinite(self._lengths))
+        if not len(reached):
+            return np.full(len(np.asarray(ends)), np.inf)
+        apart, nearest = cKDTree(self.lattice.points_m[reached]).query(ends)
+        return np.asarray(np.where(apart <= _JOIN_M, self._lengths[reached][nearest] + apart, np.inf))
+
+    def to(self, ends: ArrayLike) -> tuple[Array, int] | None:
+        """The corner points [K, 3] of a way to one of the allowed positions [G, 3], and the number of that position.
+        None if no way is found."""
+        goals = np.asarray(ends, dtype=np.float64).reshape(-1, 3)
+        points = self.lattice.points_m
+        best: tuple[float, int, int] | None = None
+        for k, end in enumerate(goals):
+            for point in _joined(self.space, self.lattice, end) if np.isfinite(self._lengths).any() else ():
+                total = self._lengths[point] + float(np.linalg.norm(points[point] - end))
+                if np.isfinite(total) and (best is None or total < best[0]):
+                    best = total, k, int(point)
+        if best is None:
+            return None
+        _, chosen, point = best
+        way = [goals[chosen]]
+        while point >= 0:
+            way.append(points[point])
+            point = int(self._before[point])
+        return _shortened(self.space, np.array([self.start, *way[::-1]])), chosen
+
+
 def find_way(space: Space, start: ArrayLike, goals: ArrayLike) -> tuple[Array, int] | None:
     """The corner points [K, 3] of a short way from an allowed position [3] to one of the allowed positions `goals`
     [G, 3], and the number of that goal. None if no way is found.
@@ -66,27 +110,7 @@ def find_way(space: Space, start: ArrayLike, goals: ArrayLike) -> tuple[Array, i
     for k in np.argsort(np.linalg.norm(ends - here, axis=1)):
         if space.free(here, ends[k]):
             return np.stack([here, ends[k]]), int(k)
-    lattice = lattice_of(space)
-    joined = _joined(space, lattice, here)
-    if not len(joined):
-        return None
-    first = joined[np.argsort(np.linalg.norm(lattice.points_m[joined] - here, axis=1))]
-    lengths, before, _ = dijkstra(lattice.lengths_m, directed=False, indices=first, min_only=True,
-                                  return_predecessors=True)
-    best: tuple[float, int, int] | None = None
-    for k, end in enumerate(ends):
-        for point in _joined(space, lattice, end):
-            total = lengths[point] + float(np.linalg.norm(lattice.points_m[point] - end))
-            if np.isfinite(total) and (best is None or total < best[0]):
-                best = total, k, int(point)
-    if best is None:
-        return None
-    _, chosen, point = best
-    way = [ends[chosen]]
-    while point >= 0:
-        way.append(lattice.points_m[point])
-        point = int(before[point])
-    return _shortened(space, np.array([here, *way[::-1]])), chosen
+    return Ways(space, here).to(ends)
 
 
 def _joined(space: Space, lattice: Lattice, point: Array) -> NDArray[np.intp]:
