@@ -28,6 +28,9 @@ VAGUE_M = 0.12  # chosen: a particle cloud with a larger deviation than this say
 BORN_VAGUE = 0.7  # chosen: share of a cloud wider than VAGUE_M that is drawn anew from a percept
 NEAREST_M = 0.05  # derived: the near plane of the simulator's camera
 MARGIN_PX = 30  # chosen: an object nearer than this to the image's border is not expected to be seen
+CARRIED_M = 0.003  # chosen: deviation that a drifting object's position gains in a step
+ELSEWHERE = 0.5  # chosen: share of the particles of an object that is gone that are drawn anew anywhere
+LOST_LOG_ODDS = -1.0  # chosen: log odds that an object that is gone is in the scene
 MOST_LOG_ODDS = 8.0  # chosen: limit of the log odds of presence, so that a few views can still change the belief
 
 
@@ -115,8 +118,13 @@ class PositionFilter:
 
         `camera` is world_from_camera [4, 4]. `others` are the other objects that are seen, with their radii (m).
         """
+        return self.clear(self.particles, camera, intrinsics_px, others)
+
+    def clear(self, points: Array, camera: Array, intrinsics_px: Array,
+              others: list[tuple[Evidence, float]]) -> NDArray[np.bool_]:
+        """The same of any points [N, 3] (m, world)."""
         hide = behind if self.config.hidden == "outlines" else beyond_nearest
-        return in_view(self.particles, camera, intrinsics_px) & ~hide(self.particles, camera[:3, 3], others)
+        return in_view(points, camera, intrinsics_px) & ~hide(points, camera[:3, 3], others)
 
     def expected(self, visible: NDArray[np.bool_]) -> float:
         """Probability that the object is seen in a view in which the particles `visible` [N] are visible."""
@@ -131,6 +139,26 @@ class PositionFilter:
         self._reweigh(np.where(visible, self.config.missed_weight, 1.0), rng)
         unseen = max(1.0 - share * (1.0 - self.config.missed_weight), 1e-3)
         self.log_odds = max(self.log_odds + np.log(unseen), -MOST_LOG_ODDS)
+
+    def carried(self, velocity_m: Array, rng: np.random.Generator) -> None:
+        """Moves the particles as an object with this velocity [3] (metres a step) does in one step."""
+        moved = self.particles + velocity_m + rng.normal(0.0, CARRIED_M, self.particles.shape)
+        self.particles = np.clip(moved, WORKSPACE_M[:, 0], WORKSPACE_M[:, 1])
+
+    def placed(self, mean: Array, covariance: Array, rng: np.random.Generator) -> None:
+        """Draws all particles anew: the object is now believed at `mean` [3] (m), with this covariance [3, 3] (m^2)."""
+        factor = np.linalg.cholesky(covariance + np.eye(3) * self.config.jitter_m ** 2)
+        drawn = mean + rng.standard_normal(self.particles.shape) @ factor.T
+        self.particles = np.clip(drawn, WORKSPACE_M[:, 0], WORKSPACE_M[:, 1])
+        self.weights = np.full(len(self.particles), 1.0 / len(self.particles))
+
+    def lost(self, rng: np.random.Generator) -> None:
+        """The object is not where it was: it may be back there soon, or anywhere."""
+        anywhere = rng.random(len(self.particles)) < ELSEWHERE
+        drawn = rng.uniform(WORKSPACE_M[:, 0], WORKSPACE_M[:, 1], self.particles.shape)
+        self.particles = np.where(anywhere[:, None], drawn, self.particles)
+        self.weights = np.full(len(self.particles), 1.0 / len(self.particles))
+        self.log_odds = min(self.log_odds, LOST_LOG_ODDS)
 
     def _reweigh(self, factors: Array, rng: np.random.Generator) -> None:
         weights = self.weights * factors
