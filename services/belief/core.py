@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from saccade.services.belief.free_energy import crop_term, identity_term, likelihood_term, pose_term, position_term
 from saccade.services.belief.motion import Change, Motion
 from saccade.services.belief.pose import GoalView, LatentLikeness, Likeness, TurnLikeness
-from saccade.services.belief.position import Evidence, PositionFilter, evidence_of
+from saccade.services.belief.position import Evidence, PositionFilter, evidence_of, of_whole
 from saccade.shared.bus.messages import Belief, Events, Percept
 from saccade.shared.bus.topics import BELIEF, EVENTS, GOAL_PERCEPT, PERCEPT, Output
 from saccade.shared.config import Config
@@ -140,7 +140,8 @@ class BeliefFilter:
         """What is noticed to have happened to an object. The belief about it then begins anew where it has to."""
         motion, position = self.motions[name], self.positions[name]
         clear = position.clear(motion.places, percept.world_from_camera, percept.intrinsics_px, others)
-        change = motion.step(percept.step, evidence_of(percept) if seen else None, clear)
+        evidence = of_whole(percept, self.radius_m[name], others) if seen else None
+        change = motion.step(percept.step, evidence, clear)
         if change is None:
             return None
         if change.kind == "gone":

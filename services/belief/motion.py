@@ -34,7 +34,8 @@ TOLD = 0.9  # chosen: probability from which an event is told
 VIEWS = 2  # chosen: percepts that an account must explain before it is believed
 ESTABLISHED = 2  # chosen: percepts of an object before anything can happen to it
 MOVED_M = 0.03  # chosen: nearer than this to where it was, an object was not moved
-FAR = 9.0  # chosen: nor is it if the squared Mahalanobis distance is smaller
+FAR = 12.0  # chosen: nor is it if the squared Mahalanobis distance is smaller
+SHARED_M = 0.008  # chosen: deviation of an account's place that more percepts do not reduce, since their errors are alike
 DRIFTED_M = 0.03  # chosen: an object drifts if it came farther than this since it began
 SLOWEST_M = 0.003  # chosen: and is faster than this, metres a step
 
@@ -73,7 +74,7 @@ class Motion:
     def __init__(self) -> None:
         self.accounts: list[Account] = []
         self.told: Account | None = None
-        self.before_gone: Account | None = None  # where it was when it was taken
+        self.anchor: Account | None = None  # where it rests, or was last, as it is known best
         self.seen = 0  # percepts so far
 
     @property
@@ -92,7 +93,7 @@ class Motion:
         if not self.accounts:
             if evidence is not None:
                 self.seen, self.accounts = 1, [_born(step, evidence, 0.0)]
-                self.told = self.accounts[0]
+                self.told = self.anchor = self.accounts[0]
             return None
         now = [_predicted(account) for account in self.accounts]
         if evidence is None:
@@ -140,8 +141,8 @@ class Motion:
 
     def _change(self) -> Change | None:
         told = self.told
-        if told is None or self.seen < ESTABLISHED:
-            self.told = max(self.accounts, key=lambda a: a.log_weight)
+        if told is None or self.anchor is None or self.seen < ESTABLISHED:
+            self.told = self.anchor = max(self.accounts, key=lambda a: a.log_weight)
             return None
         found: list[tuple[Kind, list[Account]]] = [
             ("gone", [a for a in self.accounts if a.state == "gone"] if told.state != "gone" else []),
@@ -150,23 +151,26 @@ class Motion:
              if told.state == "drifts" else []),
             ("back", [a for a in self.accounts if a.state != "gone" and a.views >= VIEWS]
              if told.state == "gone" else []),
-            ("moved", [a for a in self.accounts if a.state == "rests" and a.views >= VIEWS and _far(a, told)]
+            ("moved", [a for a in self.accounts if a.state == "rests" and a.views >= VIEWS and _far(a, self.anchor)]
              if told.state == "rests" else [])]
         for kind, accounts in found:
             probability = float(sum(np.exp(a.log_weight) for a in accounts))
             if probability > TOLD:
-                return self._tell(kind, max(accounts, key=lambda a: a.log_weight), told, probability)
+                return self._tell(kind, max(accounts, key=lambda a: a.log_weight), probability)
         likeliest = max(self.accounts, key=lambda a: a.log_weight)
-        if likeliest.state == told.state and (told.state != "rests" or not _far(likeliest, told)):
+        if likeliest.state == told.state:
             self.told = likeliest
+            if likeliest.state == "rests" and not _far(likeliest, self.anchor) and _spread(likeliest) < _spread(
+                    self.anchor):
+                self.anchor = likeliest
         return None
 
-    def _tell(self, kind: Kind, account: Account, told: Account, probability: float) -> Change:
+    def _tell(self, kind: Kind, account: Account, probability: float) -> Change:
         self.told = account
-        if kind == "gone":
-            self.before_gone = told
-        if kind == "back" and self.before_gone is not None and _far(account, self.before_gone):
+        if kind == "back" and self.anchor is not None and _far(account, self.anchor):
             kind = "moved"
+        if kind in ("moved", "back", "rests"):
+            self.anchor = account
         return Change(kind, account.place, account.covariance[:3, :3], min(probability, 1.0))
 
 
@@ -226,8 +230,12 @@ def _pruned(accounts: list[Account]) -> list[Account]:
 def _far(one: Account, other: Account) -> bool:
     """Whether two accounts place the object differently."""
     offset = one.place - other.place
-    spread = one.covariance[:3, :3] + other.covariance[:3, :3]
+    spread = one.covariance[:3, :3] + other.covariance[:3, :3] + np.eye(3) * (2 * SHARED_M ** 2)
     return bool(np.linalg.norm(offset) > MOVED_M and offset @ np.linalg.solve(spread, offset) > FAR)
+
+
+def _spread(account: Account) -> float:
+    return float(np.trace(account.covariance[:3, :3]))
 
 
 def _drifts(account: Account) -> bool:
