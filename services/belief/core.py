@@ -61,6 +61,7 @@ class BeliefFilter:
                           for name in self.names}
         self.motions = {name: Motion() for name in self.names}
         self.since = dict.fromkeys(self.names, 0)
+        self.seen_last: set[str] = set()  # objects that were seen in the last image
         self.goal_views: dict[str, GoalView] = {}
         self.last_seen: dict[str, Percept] = {}
         self.goal_known = False
@@ -82,6 +83,7 @@ class BeliefFilter:
         changes: dict[str, Change] = {}
         for name in self.names:
             yield Output(BELIEF, self._update(name, percepts, present, changes), name)
+        self.seen_last = present
         yield Output(EVENTS, _events(percepts[self.names[0]], changes))
 
     def _likeness(self, goal: Percept) -> list[Likeness]:
@@ -131,7 +133,7 @@ class BeliefFilter:
         velocity_m = self.motions[name].velocity_m
         if velocity_m is None:
             return
-        self.positions[name].carried(velocity_m, rng)
+        self.positions[name].carried(velocity_m, name in self.seen_last, rng)
         if name in self.goal_views:
             self.goal_views[name].carried(velocity_m, step)
 
@@ -141,7 +143,7 @@ class BeliefFilter:
         motion, position = self.motions[name], self.positions[name]
         clear = position.clear(motion.places, percept.world_from_camera, percept.intrinsics_px, others)
         evidence = of_whole(percept, self.radius_m[name], others) if seen else None
-        change = motion.step(percept.step, evidence, clear)
+        change = motion.step(percept.step, evidence, percept.presence, clear)
         if change is None:
             return None
         if change.kind == "gone":

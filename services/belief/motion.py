@@ -21,7 +21,7 @@ State = Literal["rests", "drifts", "gone"]
 Kind = Literal["moved", "turned", "gone", "back", "drifts", "rests"]
 
 LOG_RATE = float(np.log(0.01))  # chosen: rate at which something happens to an object, in a step
-OUTLIER = 0.02  # chosen: probability that a percept is of something else
+LEAST_OUTLIER = 0.02  # chosen: least probability that a percept is of something else
 OVERLOOKED = 0.1  # chosen: probability that an object in clear view is not seen
 LOG_ELSEWHERE = -float(np.log(VOLUME_M3))  # density of a percept of something else, anywhere
 KEPT = 8  # chosen: accounts that are kept
@@ -32,7 +32,7 @@ ACCELERATION_M = 0.0015  # chosen: deviation by which a velocity changes in a st
 HEIGHT_M = 0.05  # chosen: deviation by which the height of a centre changes when an object is moved or falls over
 TOLD = 0.9  # chosen: probability from which an event is told
 VIEWS = 2  # chosen: percepts that an account must explain before it is believed
-ESTABLISHED = 2  # chosen: percepts of an object before anything can happen to it
+ESTABLISHED = 5.0  # chosen: log odds by its percepts that an object is there, before anything can happen to it
 MOVED_M = 0.03  # chosen: nearer than this to where it was, an object was not moved
 FAR = 12.0  # chosen: nor is it if the squared Mahalanobis distance is smaller
 SHARED_M = 0.008  # chosen: deviation of an account's place that more percepts do not reduce, since their errors are alike
@@ -75,7 +75,7 @@ class Motion:
         self.accounts: list[Account] = []
         self.told: Account | None = None
         self.anchor: Account | None = None  # where it rests, or was last, as it is known best
-        self.seen = 0  # percepts so far
+        self.log_odds = 0.0  # that it is there, by its percepts so far
 
     @property
     def velocity_m(self) -> Array | None:
@@ -87,12 +87,13 @@ class Motion:
         """Where the object is by each of its accounts [A, 3]."""
         return np.array([account.place for account in self.accounts]).reshape(-1, 3)
 
-    def step(self, step: int, evidence: Evidence | None, clear: NDArray[np.bool_]) -> Change | None:
-        """Takes one image: a percept, or that the object is not seen. `clear` [A] says of each account whether the
-        object would be in clear view. Returns what is believed to have happened, if this is new."""
+    def step(self, step: int, evidence: Evidence | None, presence: float, clear: NDArray[np.bool_]) -> Change | None:
+        """Takes one image: a percept and the probability that it is of the object, or None if it is not seen. `clear`
+        [A] says of each account whether the object would be in clear view. Returns what is believed to have happened,
+        if this is new."""
         if not self.accounts:
             if evidence is not None:
-                self.seen, self.accounts = 1, [_born(step, evidence, 0.0)]
+                self.log_odds, self.accounts = _log_odds(presence), [_born(step, evidence, 0.0)]
                 self.told = self.anchor = self.accounts[0]
             return None
         now = [_predicted(account) for account in self.accounts]
@@ -100,9 +101,11 @@ class Motion:
             now = [_missed(account, bool(seen)) for account, seen in zip(now, clear, strict=True)]
             now += self._gone(step, now)
         else:
-            self.seen += 1
-            now = [_explained(account, evidence) for account in [*now, *self._moving(step, now)]]
-            now.append(_born(step, evidence, LOG_RATE + LOG_ELSEWHERE + self._level(evidence)))
+            self.log_odds += _log_odds(presence)
+            outlier = max(1.0 - presence, LEAST_OUTLIER)
+            now = [_explained(account, evidence, outlier) for account in [*now, *self._moving(step, now)]]
+            level = LOG_ELSEWHERE + self._level(evidence)
+            now.append(_born(step, evidence, LOG_RATE + float(np.log(1.0 - outlier)) + level))
         self.accounts = _pruned(now)
         return self._change()
 
@@ -122,27 +125,23 @@ class Motion:
         return [] if here is None else [Account("gone", step, here.mean, here.covariance, LOG_RATE)]
 
     def _moving(self, step: int, now: list[Account]) -> list[Account]:
-        """What begins to drift from where it rests, and what comes to rest."""
+        """What begins to drift, what comes to rest, and what turns back."""
         new = []
         here = max((a for a in now if a.state != "gone"), key=lambda a: a.log_weight, default=None)
         if here is not None and here.views >= VIEWS:
-            mean, covariance = here.mean.copy(), here.covariance.copy()
-            mean[3:], covariance[3:], covariance[:, 3:] = 0.0, 0.0, 0.0
-            covariance += np.diag([SPEED_M ** 2, SPEED_M ** 2, 0.0] * 2)
-            new.append(replace(here, state="drifts", since=step, mean=mean, covariance=covariance, start=here.place,
-                               views=0, log_weight=here.log_weight + LOG_RATE))
+            new.append(_with_velocity(here, "drifts", step, np.zeros(3), SPEED_M))
         drifts = max((a for a in now if a.state == "drifts"), key=lambda a: a.log_weight, default=None)
         if drifts is not None and drifts.views >= VIEWS:
-            mean, covariance = drifts.mean.copy(), drifts.covariance.copy()
-            mean[3:], covariance[3:], covariance[:, 3:] = 0.0, 0.0, 0.0
-            new.append(replace(drifts, state="rests", since=step, mean=mean, covariance=covariance, start=None, views=0,
-                               log_weight=drifts.log_weight + LOG_RATE))
+            new.append(_with_velocity(drifts, "drifts", step, -drifts.mean[3:], ACCELERATION_M))
+            new.append(_with_velocity(drifts, "rests", step, np.zeros(3), 0.0))
         return new
 
     def _change(self) -> Change | None:
         told = self.told
-        if told is None or self.anchor is None or self.seen < ESTABLISHED:
+        if told is None or self.anchor is None or self.log_odds < ESTABLISHED:
             self.told = self.anchor = max(self.accounts, key=lambda a: a.log_weight)
+            if self.told.state == "gone":  # what was not sure to be there need not have gone
+                self.accounts, self.log_odds = [], 0.0
             return None
         found: list[tuple[Kind, list[Account]]] = [
             ("gone", [a for a in self.accounts if a.state == "gone"] if told.state != "gone" else []),
@@ -181,6 +180,15 @@ def _born(step: int, evidence: Evidence, log_weight: float) -> Account:
     return Account("rests", step, np.concatenate([evidence.mean, np.zeros(3)]), covariance, log_weight, views=1)
 
 
+def _with_velocity(account: Account, state: State, step: int, velocity_m: Array, deviation_m: float) -> Account:
+    """What begins with this step, from where the object is by an account: another velocity [3] (m a step)."""
+    mean, covariance = account.mean.copy(), account.covariance.copy()
+    mean[3:], covariance[3:], covariance[:, 3:] = velocity_m, 0.0, 0.0
+    covariance += np.diag([deviation_m ** 2, deviation_m ** 2, 0.0] * 2)
+    return replace(account, state=state, since=step, mean=mean, covariance=covariance, views=0,
+                   start=account.place if state == "drifts" else None, log_weight=account.log_weight + LOG_RATE)
+
+
 def _predicted(account: Account) -> Account:
     """The account one step later."""
     if account.state == "gone":
@@ -200,21 +208,27 @@ def _missed(account: Account, clear: bool) -> Account:
     return replace(account, log_weight=account.log_weight + np.log(OVERLOOKED))
 
 
-def _explained(account: Account, evidence: Evidence) -> Account:
-    """The account after a percept: a Kalman filter's update, with the density that it gave the percept."""
+def _explained(account: Account, evidence: Evidence, outlier_share: float) -> Account:
+    """The account after a percept: a Kalman filter's update, with the density that it gave the percept. This is of
+    something else with the probability `outlier_share`."""
+    outlier = float(np.log(outlier_share)) + LOG_ELSEWHERE
     if account.state == "gone":
-        return replace(account, log_weight=account.log_weight + np.log(OUTLIER) + LOG_ELSEWHERE)
+        return replace(account, log_weight=account.log_weight + outlier)
     spread = account.covariance[:3, :3] + evidence.covariance
     offset = evidence.mean - account.place
     inverse = np.linalg.inv(spread)
     log_density = -0.5 * (offset @ inverse @ offset + np.linalg.slogdet(2 * np.pi * spread)[1])
-    inlier, outlier = np.log(1 - OUTLIER) + log_density, np.log(OUTLIER) + LOG_ELSEWHERE
+    inlier = float(np.log(1.0 - outlier_share)) + log_density
     weight = account.log_weight + float(np.logaddexp(inlier, outlier))
     if inlier < outlier:
         return replace(account, log_weight=weight)
     gain = account.covariance[:, :3] @ inverse
     return replace(account, mean=account.mean + gain @ offset, log_weight=weight, views=account.views + 1,
                    covariance=account.covariance - gain @ account.covariance[:3])
+
+
+def _log_odds(presence: float) -> float:
+    return float(np.log(presence / max(1.0 - presence, 1e-3)))
 
 
 def _pruned(accounts: list[Account]) -> list[Account]:

@@ -35,6 +35,7 @@ WHOLE_SHARE = 0.5  # chosen: of the variance of evidence, which allows for parts
 OUTSIDE_M = 0.04  # chosen: a percept that is farther outside of the workspace than this is of a part, or wrong
 MARGIN_PX = 30  # chosen: an object nearer than this to the image's border is not expected to be seen
 CARRIED_M = 0.003  # chosen: deviation that a drifting object's position gains in a step
+UNSEEN = 1.5  # chosen: deviation of its speed, in units of the speed, while it is not seen
 ELSEWHERE = 0.5  # chosen: share of the particles of an object that is gone that are drawn anew anywhere
 LOST_LOG_ODDS = -1.0  # chosen: log odds that an object that is gone is in the scene
 MOST_LOG_ODDS = 8.0  # chosen: limit of the log odds of presence, so that a few views can still change the belief
@@ -164,9 +165,12 @@ class PositionFilter:
         unseen = max(1.0 - share * (1.0 - self.config.missed_weight), 1e-3)
         self.log_odds = max(self.log_odds + np.log(unseen), -MOST_LOG_ODDS)
 
-    def carried(self, velocity_m: Array, rng: np.random.Generator) -> None:
-        """Moves the particles as an object with this velocity [3] (metres a step) does in one step."""
+    def carried(self, velocity_m: Array, seen: bool, rng: np.random.Generator) -> None:
+        """Moves the particles as an object with this velocity [3] (metres a step) does in one step. If it was not
+        `seen` in the last image, it may have stopped or turned back."""
         moved = self.particles + velocity_m + rng.normal(0.0, CARRIED_M, self.particles.shape)
+        if not seen:
+            moved += rng.normal(0.0, UNSEEN, (len(moved), 1)) * velocity_m
         self.particles = np.clip(moved, WORKSPACE_M[:, 0], WORKSPACE_M[:, 1])
 
     def placed(self, mean: Array, covariance: Array, rng: np.random.Generator) -> None:
