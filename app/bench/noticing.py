@@ -46,6 +46,7 @@ class _Watched:
 
     now: _Pose
     seen: _Pose | None = None  # as it was when it, or its place, was in view last
+    place: Boxes | None = None  # where it was when it was in view last
     images: int | None = None  # since the change that is to be noticed came into view
     open: bool = False  # there is a change that a report may be of
     reported: int | None = None  # the step of the first report of it
@@ -100,7 +101,7 @@ def _look(each: _Watched, truth: Truth, label: str, boxes: dict[str, Boxes]) -> 
     """Takes whether the image shows the object, or that it is not where it was."""
     if not _in_view(each, truth, label, boxes):
         return
-    seen, each.seen = each.seen, each.now
+    seen, each.seen, each.place = each.seen, each.now, each.now.box or each.place
     if each.images is not None:
         each.images += 1
     elif seen is not None and seen.changes != each.now.changes and not _same(seen.box, each.now.box):
@@ -113,9 +114,9 @@ def _in_view(each: _Watched, truth: Truth, label: str, boxes: dict[str, Boxes]) 
     if each.now.box is not None:
         shares: NDArray[np.float64] = np.ones(len(truth.names)) if truth.in_view is None else truth.in_view
         return bool(shares[truth.labels().index(label)] >= IN_VIEW)
-    if each.seen is None or each.seen.box is None:
+    if each.place is None:
         return False
-    all_boxes = [each.seen.box, *boxes.values()]
+    all_boxes = [each.place, *boxes.values()]
     together = Boxes(*(np.concatenate([getattr(b, name) for b in all_boxes])
                        for name in ("centers_m", "rotations", "sizes_m")))
     return bool(seen_shares(truth.world_from_camera, together, NO_BOXES)[0] >= IN_VIEW)

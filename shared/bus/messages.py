@@ -145,6 +145,8 @@ class Percept(Message):
 class Belief(Message):
     """The posterior over one object: where it is, and from where it would look like the goal."""
 
+    VERSION: ClassVar[int] = 2
+
     object: str
     """Name of the object."""
     presence: float

@@ -23,6 +23,8 @@ Change = Callable[[Topic, str | None, Fields], Fields]
 OLDEST = 1  # the format of logs that do not name one
 ADDED = {m.Percept: ("mask_bits",), m.Plan: ("best_eyes_m", "best_g")}  # fields that older logs lack; they become None
 
+SINCE = {"events": 7}  # topics that older formats do not have, and the format since which they exist
+
 
 def count_in_episodes() -> Change:
     """Format 1 to 2: sequence numbers count from 0 in every episode, no longer through the whole run."""
@@ -78,8 +80,16 @@ def with_places_and_instances() -> Change:
     return change
 
 
+def with_motion() -> Change:
+    """Format 6 to 7: a belief may tell how an object moves. The topic `events` is new."""
+    def change(topic: Topic, part: str | None, fields: Fields) -> Fields:
+        return fields | {"version": 2, "velocity_m": None, "since_step": 0} if topic.type is m.Belief else fields
+
+    return change
+
+
 CHANGES: tuple[Callable[[], Change], ...] = (count_in_episodes, with_masks_and_candidates, with_poses,
-                                             with_several_rotations, with_places_and_instances)
+                                             with_several_rotations, with_places_and_instances, with_motion)
 FORMAT = OLDEST + len(CHANGES)
 
 
