@@ -63,7 +63,7 @@ def test_an_object_that_is_elsewhere_was_moved(seed):
 
 def test_an_object_that_was_pushed_over_was_moved():
     """Its centre comes down by some centimetres, and goes aside."""
-    noticed, _ = play([HERE] * 5 + [HERE + (0.01, 0.05, -0.025)] * 8)
+    noticed, _ = play([HERE] * 5 + [HERE + np.array([0.01, 0.05, -0.025])] * 8)
     assert [kind for _, kind in noticed] == ["moved"]
 
 
@@ -163,8 +163,8 @@ def test_kept_views_go_with_what_drifts_and_are_forgotten_when_it_is_moved():
     view.seen(percept(HERE, camera_at(5), rng, step=5), HERE)
     eyes = [keyframe.eye.copy() for keyframe in view.keyframes]
     view.carried(np.array([0.02, 0.0, 0.0]), 6)
-    assert [np.allclose(k.eye, eye + (0.02, 0.0, 0.0)) for k, eye in zip(view.keyframes, eyes, strict=True)] == [True] * 2
-    assert np.allclose(view.center, HERE + (0.02, 0.0, 0.0))
+    np.testing.assert_allclose([k.eye for k in view.keyframes], np.array(eyes) + np.array([0.02, 0.0, 0.0]))
+    np.testing.assert_allclose(view.center, HERE + np.array([0.02, 0.0, 0.0]))
     view.carried(np.array([0.02, 0.0, 0.0]), 10)
     assert [keyframe.percept.step for keyframe in view.keyframes] == [5]
     view.forget()

@@ -78,7 +78,7 @@ def test_what_was_put_back_before_anybody_looked_is_no_change():
 
 
 def test_a_drift_is_one_change_and_every_report_of_it_is_right():
-    drifting = [truth(step, HERE + (0.0, 0.005 * max(step - 2, 0), 0.0)) for step in range(30)]
+    drifting = [truth(step, HERE + np.array([0.0, 0.005 * max(step - 2, 0), 0.0])) for step in range(30)]
     assert noticed(drifting, [report(6, "mug"), report(14, "mug"), report(25, "mug")]) == Noticed(1, 1, 0)
 
 

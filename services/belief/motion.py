@@ -20,9 +20,10 @@ Array = NDArray[np.float64]
 State = Literal["rests", "drifts", "gone"]
 Kind = Literal["moved", "turned", "gone", "back", "drifts", "rests"]
 
-LOG_RATE = float(np.log(0.01))  # chosen: rate at which something happens to an object, in a step
+RATE = 0.01  # chosen: probability that something happens to an object, in a step
 LEAST_OUTLIER = 0.02  # chosen: least probability that a percept is of something else
 OVERLOOKED = 0.1  # chosen: probability that an object in clear view is not seen
+LOG_RATE = float(np.log(RATE))
 LOG_ELSEWHERE = -float(np.log(VOLUME_M3))  # density of a percept of something else, anywhere
 KEPT = 8  # chosen: accounts that are kept
 LEAST_LOG_WEIGHT = -12.0  # chosen: accounts with less are dropped
@@ -35,7 +36,7 @@ VIEWS = 2  # chosen: percepts that an account must explain before it is believed
 ESTABLISHED = 5.0  # chosen: log odds by its percepts that an object is there, before anything can happen to it
 MOVED_M = 0.03  # chosen: nearer than this to where it was, an object was not moved
 FAR = 12.0  # chosen: nor is it if the squared Mahalanobis distance is smaller
-SHARED_M = 0.008  # chosen: deviation of an account's place that more percepts do not reduce, since their errors are alike
+SHARED_M = 0.008  # chosen: deviation of a place that more percepts do not reduce, since their errors are alike
 DRIFTED_M = 0.03  # chosen: an object drifts if it came farther than this since it began
 SLOWEST_M = 0.003  # chosen: and is faster than this, metres a step
 
