@@ -258,23 +258,20 @@ def run_scene(agent: str, config_text: str, number: int) -> dict[str, Any]:
     """Runs one scene within this process as episode `number`, and returns its record with what the agent noticed of
     the events, the seconds of the scene and the mean milliseconds per step of each service."""
     config, pairs = cores(agent, config_text)
-    results: list[Result] = []
-    truths: list[Truth] = []
-    events: list[Events] = []
+    heard: dict[type[Message], list[Any]] = {Result: [], Truth: [], Events: []}
     spent_ms: dict[str, list[float]] = {service.name: [] for service, _ in pairs}
     start = time.perf_counter()
 
     def hear(_topic: Topic, _part: str | None, message: Message, _payload: bytes | None) -> None:
-        for kind, heard in ((Result, results), (Truth, truths), (Events, events)):
-            if isinstance(message, kind):
-                heard.append(message)
+        if type(message) in heard:
+            heard[type(message)].append(message)
 
     run_local(pairs, config.names, RUN, (number,), hear,
               on_step=lambda service, milliseconds: spent_ms[service].append(milliseconds))
     seconds = round(time.perf_counter() - start, 3)
     means = {service: round(fmean(values), 3) for service, values in spent_ms.items() if values}
-    told = noticed(truths, events)._asdict() if events else {}  # not every agent tells events
-    return record_of(results[0]) | told | {"seconds": seconds, "milliseconds": means}
+    told = noticed(heard[Truth], heard[Events])._asdict() if heard[Events] else {}  # not every agent tells events
+    return record_of(heard[Result][0]) | told | {"seconds": seconds, "milliseconds": means}
 
 
 def record_of(result: Result) -> dict[str, Any]:

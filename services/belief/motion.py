@@ -14,7 +14,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from saccade.services.belief.position import VOLUME_M3, Evidence
+from saccade.services.belief.position import WORKSPACE_M, Evidence
 
 Array = NDArray[np.float64]
 State = Literal["rests", "drifts", "gone"]
@@ -24,7 +24,7 @@ RATE = 0.01  # chosen: probability that something happens to an object, in a ste
 LEAST_OUTLIER = 0.02  # chosen: least probability that a percept is of something else
 OVERLOOKED = 0.1  # chosen: probability that an object in clear view is not seen
 LOG_RATE = float(np.log(RATE))
-LOG_ELSEWHERE = -float(np.log(VOLUME_M3))  # density of a percept of something else, anywhere
+LOG_ELSEWHERE = -float(np.log(np.diff(WORKSPACE_M).prod()))  # density of a percept of something else, anywhere
 KEPT = 8  # chosen: accounts that are kept
 LEAST_LOG_WEIGHT = -12.0  # chosen: accounts with less are dropped
 CREEP_M = 0.002  # chosen: deviation that is added in a step, since percepts from near are better than their average

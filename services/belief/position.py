@@ -71,9 +71,11 @@ def evidence_of(percept: Percept, covariance: str = "calibrated") -> Evidence:
     return Evidence(camera[:3, 3] + range_m * ray, spread, range_m, ray)
 
 
-def of_whole(percept: Percept, radius_m: float, others: list[tuple[Evidence, float]]) -> Evidence:
+def of_whole(percept: Percept, radius_m: float, others: list[tuple[Evidence, float]],
+             extent_m: Array = WORKSPACE_M) -> Evidence:
     """What a percept says of where the whole object is. It says less the more of the object lies beyond the border of
-    the image, or behind one of the `others`, because the centre of what is seen is then somewhere else."""
+    the image, or behind one of the `others`, because the centre of what is seen is then somewhere else. Objects are
+    within `extent_m` [3, 2]."""
     evidence = evidence_of(percept)
     radius_px = percept.intrinsics_px[0] * radius_m / evidence.range_m
     free = [float(np.minimum(percept.pixel, IMAGE_SIZE_PX - percept.pixel).min()) / radius_px]
@@ -82,7 +84,7 @@ def of_whole(percept: Percept, radius_m: float, others: list[tuple[Evidence, flo
             apart = np.arccos(np.clip(evidence.direction @ other.direction, -1.0, 1.0))
             free.append(apart / (np.arctan(radius_m / evidence.range_m) + np.arctan(other_radius_m / other.range_m)))
     lacks = float(np.clip(1.0 - min(free) / WHOLE, 0.0, 1.0))
-    if np.any((evidence.mean < WORKSPACE_M[:, 0] - OUTSIDE_M) | (evidence.mean > WORKSPACE_M[:, 1] + OUTSIDE_M)):
+    if np.any((evidence.mean < extent_m[:, 0] - OUTSIDE_M) | (evidence.mean > extent_m[:, 1] + OUTSIDE_M)):
         lacks = 1.0
     outer = np.outer(evidence.direction, evidence.direction)
     wider = (PART_M * lacks) ** 2 * (np.eye(3) - outer) + (PART_SHARE * lacks * evidence.range_m) ** 2 * outer
