@@ -10,14 +10,15 @@ from pathlib import Path
 
 from saccade.shared.config import PACKAGE, BeliefConfig, PlannerConfig, Section
 
-MODULES = ("services.belief.core", "services.belief.pose", "services.belief.position", "services.belief.attitude",
-           "services.planner.core", "services.planner.candidates", "services.planner.place",
-           "services.planner.free_energy")
+MODULES = ("services.belief.core", "services.belief.motion", "services.belief.pose", "services.belief.position",
+           "services.belief.attitude", "services.planner.core", "services.planner.candidates", "services.planner.place",
+           "services.planner.free_energy", "services.planner.moving")
 SECTIONS: dict[str, type[Section]] = {"belief": BeliefConfig, "planner": PlannerConfig}
 KINDS = ("chosen", "derived", "measured", "from the")  # a constant's comment begins with one of these
 # These are not listed: one is a number of the paper, the other is for the viewer only
 SHOWN = ("planner.step_m", "belief.published_particles")
-PROBABILITIES = {"PRESENT", "BORN_VAGUE", "SURE", "DETECTED", "USED_VIEW", "UPRIGHT", "SEEN", "belief.present_above",
+PROBABILITIES = {"PRESENT", "BORN_VAGUE", "SURE", "DETECTED", "USED_VIEW", "UPRIGHT", "SEEN", "RATE",
+                 "LEAST_OUTLIER", "OVERLOOKED", "TOLD", "ELSEWHERE", "belief.present_above",
                  "planner.goal_confidence", "belief.resample_below", "belief.view_worth", "belief.missed_weight"}
 
 

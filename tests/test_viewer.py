@@ -16,9 +16,9 @@ from saccade.app.run.run import run
 from saccade.services.viewer.core import Viewer
 from saccade.services.viewer.curves import F_TERMS, G_TERMS, entropy_nats
 from saccade.services.viewer.images import outline
-from saccade.services.viewer.words import decision, plain
+from saccade.services.viewer.words import decision, happened, plain
 from saccade.services.viewer.world import PATH_LENGTH
-from saccade.shared.bus.topics import BELIEF, FRAME, PERCEPT, PLAN, STATUS, TRUTH
+from saccade.shared.bus.topics import BELIEF, EVENTS, FRAME, PERCEPT, PLAN, STATUS, TRUTH
 from saccade.shared.config import Config
 from saccade.shared.log.reading import RunReader
 from saccade.shared.world.geometry import INTRINSICS_PX, look_at
@@ -255,6 +255,24 @@ def test_what_is_kept_of_a_step_does_not_grow_with_the_run(tmp_path):
 def test_decisions_in_words(changes, presence, words):
     plan = sample(PLAN.type, **{"arrived": False, "target": "mug"} | changes)
     assert decision(plan, [sample(BELIEF.type, object="005_tomato_soup_can", presence=presence)]) == words
+
+
+def test_events_in_words_and_as_marks(tmp_path):
+    """Each event is one line among the decisions, and a mark with its name in the world."""
+    events = sample(EVENTS.type, run="r", episode=0, step=3, objects=["005_tomato_soup_can", "mug"],
+                    kinds=["moved", "gone"], positions_m=np.array([[0.1, 0.2, 0.05], [0.0, 0.0, 0.1]]),
+                    probabilities=np.array([0.97, 1.0]))
+    said = ["the tomato soup can was moved (97 %)", "the mug is gone (100 %)"]
+    assert happened(events) == said
+    recording = rr.RecordingStream("saccade")
+    recording.save(tmp_path / "run.rrd")
+    viewer = Viewer(recording, Config(), truth=False, live=False)
+    viewer.take(EVENTS, None, events)
+    viewer.close()
+    recording.disconnect()
+    seen = Seen(tmp_path / "run.rrd")
+    assert seen.words()[:2] == said
+    np.testing.assert_allclose(seen.of("/world/events", "Points3D:positions")[3], events.positions_m, atol=1e-6)
 
 
 def test_an_outline_goes_round_the_cells():

@@ -11,6 +11,7 @@ from typing import Any
 from rich.table import Table
 from rich.text import Text
 
+from saccade.app.bench.noticing import WITHIN
 from saccade.shared.errors import printable
 
 Record = Mapping[str, Any]
@@ -121,6 +122,23 @@ def milliseconds(records: Sequence[Record]) -> dict[str, float]:
     return {s: sum(ms for ms, _ in parts) / max(1, sum(n for _, n in parts)) for s, parts in sums.items()}
 
 
+def noticed_words(records: Sequence[Record]) -> str:
+    """What the agent noticed of the events in these scenes, in one line. It is empty if it tells no events."""
+    told = [r for r in records if "false_events" in r]
+    if not told:
+        return ""
+    quiet = wilson(sum(not r["false_events"] for r in told), len(told))
+    text = f"no event reported where there was none: in {_percent(quiet)} of {len(told)} scenes"
+    if changes := sum(r["changes"] for r in told):
+        share = wilson(sum(r["noticed"] for r in told), changes)
+        text = f"noticed within {WITHIN} images: {_percent(share)} of {changes} changes; {text}"
+    return text
+
+
+def _percent(share: Estimate) -> str:
+    return f"{100 * share.value:.1f} % ({100 * share.low:.1f} to {100 * share.high:.1f})"
+
+
 def rows(records: Sequence[Record]) -> list[Row]:
     """One row for each target, in the order of their first scenes, and the total."""
     targets = dict.fromkeys(r["target"] for r in records)
@@ -137,6 +155,8 @@ def render(records: Sequence[Record], *, title: str) -> Table:
     caption += "false: of all scenes"
     if spent := milliseconds(records):
         caption += "\nmilliseconds per step: " + ", ".join(f"{name} {ms:.1f}" for name, ms in spent.items())
+    if events := noticed_words(records):
+        caption += f"\nevents {events}"
     table = Table(title=Text(printable(title), style="table.title"), caption=caption, show_lines=True)
     for header in ("target", "", "n"):
         table.add_column(header)

@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from saccade.app.log.source import log_of
-from saccade.shared.bus.messages import Action, Belief, Frame, Goal, Percept, Plan, Result, Truth
+from saccade.shared.bus.messages import Action, Belief, Events, Frame, Goal, Percept, Plan, Result, Truth
 from saccade.shared.bus.topics import (
     ACTION,
     BELIEF,
+    EVENTS,
     FRAME,
     GOAL,
     GOAL_PERCEPT,
@@ -80,6 +81,11 @@ class Step(_Messages):
     def beliefs(self) -> Mapping[str, Belief]:
         """The belief about each object after the frame, by the object's name."""
         return self._by_part(BELIEF)
+
+    @property
+    def events(self) -> Events | None:
+        """What the belief noticed in the frame: what was moved, turned, taken away or put back, and what drifts."""
+        return self._get(EVENTS)
 
     @property
     def plan(self) -> Plan | None:

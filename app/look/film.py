@@ -23,8 +23,8 @@ from saccade.app.look.picture import PRESENT_ABOVE, Story, colours, image, new_f
 from saccade.services.viewer.curves import entropy_nats
 from saccade.services.viewer.images import outline
 from saccade.services.viewer.imagination import Imagination
-from saccade.services.viewer.words import decision, ending, plain
-from saccade.shared.bus.messages import Belief, Message, Percept, Plan, Result, Truth
+from saccade.services.viewer.words import decision, ending, happened, plain
+from saccade.shared.bus.messages import Belief, Events, Message, Percept, Plan, Result, Truth
 from saccade.shared.bus.topics import FRAME, PERCEPT, Topic
 from saccade.shared.config import Config, recorded
 from saccade.shared.errors import SaccadeError
@@ -33,6 +33,7 @@ from saccade.shared.model.weights import Weights
 
 INCHES, DPI = (12.8, 7.2), 100  # both sides must be an even number of pixels for H.264
 GIF_DPI, GIF_COLOURS = 60, 96
+EVENT_STEPS = 10  # for so many steps a film tells in words what was noticed
 LAST_S = 2.0  # the last picture stays for so long
 SUFFIXES = (".mp4", ".gif")
 
@@ -52,6 +53,7 @@ class Scene:
     # By object and step: entropy of the position, nats
     entropies: dict[str, dict[int, float]] = field(default_factory=dict)
     words: str = ""
+    events: Events | None = None  # the last message in which something was noticed
 
     def take(self, topic: Topic, part: str | None, message: Message) -> None:
         """Stores what a message of this episode says."""
@@ -64,6 +66,8 @@ class Scene:
                 self.seen[part] = message
         elif isinstance(message, Belief) and part is not None:
             self.entropies.setdefault(part, {})[message.step] = entropy_nats(message)
+        elif isinstance(message, Events) and message.objects:
+            self.events = message
         elif isinstance(message, Plan):
             self.words = decision(message, self.story.beliefs.values())
             if message.believed_distance_m >= 0:
@@ -146,11 +150,18 @@ def picture_of(scene: Scene, imagination: Imagination | None, dpi: int) -> Pictu
         planned = imagination.planned_view(story.plan.viewpoint, known, scene.seen)
     image(figure.add_subplot(grid[1, 2]), planned, "planned view, imagined")
     _curves(figure, grid, scene, of_object)
-    figure.suptitle(f"step {story.last_step}    {scene.words}", x=0.02, ha="left", fontsize=13)
+    figure.suptitle(f"step {story.last_step}    {scene.words}{_noticed(scene)}", x=0.02, ha="left", fontsize=13)
     canvas = figure.canvas
     assert isinstance(canvas, FigureCanvasAgg)  # new_figure makes one
     canvas.draw()
     return np.ascontiguousarray(np.asarray(canvas.buffer_rgba())[..., :3])
+
+
+def _noticed(scene: Scene) -> str:
+    """What was noticed within the last steps, in words."""
+    events = scene.events
+    is_new = events is not None and scene.story.last_step < events.step + EVENT_STEPS
+    return f"    noticed at step {events.step}: {', '.join(happened(events))}" if events and is_new else ""
 
 
 def _camera(axes: Axes, scene: Scene, imagination: Imagination | None, of_object: dict[str, str]) -> None:
@@ -189,6 +200,9 @@ def _table(axes: Axes, scene: Scene) -> None:
     if story.truth is not None and story.goal_is_known:
         axes.plot(*story.truth.goal_world_from_camera[:2, 3], "*", color="black", markersize=13, label="goal's view",
                   linestyle="none")
+    if scene.events is not None:
+        axes.plot(*scene.events.positions_m[:, :2].T, "X", color="#d02020", markersize=10, markeredgecolor="white",
+                  label=f"event at step {scene.events.step}", linestyle="none")
     way(axes, np.array(story.path_m))
     axes.set(xlabel="", ylabel="")
     axes.legend(loc="upper left", fontsize=7, framealpha=0.8)

@@ -26,6 +26,7 @@ from saccade.shared.bus.wire import MessageError, Stamp, decode, encode, stamp_o
 from saccade.shared.config import Config, recorded
 from saccade.shared.errors import SaccadeError
 from saccade.shared.log.folder import CONFIG_NAME, LOG_NAME
+from saccade.shared.log.migrations import OLDEST, SINCE
 from saccade.shared.log.reading import Recorded, RunReader
 from saccade.shared.log.recording import RunLog
 from saccade.shared.loop.episodes import READY_STATES
@@ -93,7 +94,9 @@ def prepare(log: Path, into: Sequence[str], values: dict, *, pace: Pace, topics:
     def chosen(names: tuple[Topic, ...]) -> Selection:
         return Selection(names, episode=episode, start_step=start_step, end_step=end_step)
 
-    outputs = tuple(TOPICS[name] for name in sorted(made))
+    reader = RunReader(log)
+    next(reader.entries(), None)  # with it the log's format is known, and what it did not have cannot be compared
+    outputs = tuple(TOPICS[name] for name in sorted(made) if reader.format >= SINCE.get(name, OLDEST))
     holes = holes_of(log, inputs, outputs, config.names, live=live)
     return Replay(log, ordered, config, pace, chosen(inputs), chosen(outputs), one_by_one, live, holes)
 
@@ -126,7 +129,8 @@ def replay_here(replay: Replay, out: Path, keys: Keys, say: Callable[[str], None
             maker = next(s.name for s in replay.services if output.topic in s.outputs)
             raise SaccadeError(f"{maker} gives an invalid {output.topic.name}: {error}") from error
         log.write(output.topic, output.part, payload, sequence=output.message.seq)
-        twins.replayed(output.topic, output.part, payload)
+        if output.topic in replay.outputs.topics:
+            twins.replayed(output.topic, output.part, payload)
 
     try:
         for entry, stamp in played(replay, keys, say, outcome, twins):
@@ -250,7 +254,7 @@ class _Playing:
         self._reached: dict[str, dict[tuple[str, str | None], int]] = {}  # by played topic: answers on each key
         self._error: BaseException | None = None
         for service in replay.services:
-            for topic in (topic for topic in service.outputs if not topic.latched):
+            for topic in (t for t in service.outputs if not t.latched and t in replay.outputs.topics):
                 parts = replay.config.names if topic.parts else (None,)
                 self._reached.setdefault(self._cause(service).name, {}).update({(topic.name, p): 0 for p in parts})
 

@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from saccade.app.run.registry import DEFAULT_AGENT, agent_pairs
 from saccade.services.camera.virtual_camera import VirtualCamera
-from saccade.shared.bus.messages import Action, Belief, Frame, Goal, Message, Percept, Plan
-from saccade.shared.bus.topics import ACTION, BELIEF, FRAME, GOAL, GOAL_PERCEPT, PERCEPT, PLAN, Output, Topic
+from saccade.shared.bus.messages import Action, Belief, Events, Frame, Goal, Message, Percept, Plan
+from saccade.shared.bus.topics import ACTION, BELIEF, EVENTS, FRAME, GOAL, GOAL_PERCEPT, PERCEPT, PLAN, Output, Topic
 from saccade.shared.config import Config
 from saccade.shared.errors import SaccadeError
 from saccade.shared.loop.local import Pump
@@ -56,6 +56,7 @@ class Agent:
         self.percepts: dict[str, Percept] = {}
         self.goal_percepts: dict[str, Percept] = {}
         self.beliefs: dict[str, Belief] = {}
+        self.events: Events | None = None
         self.plan: Plan | None = None
         self._action: Action | None = None
         self._pump = Pump([Stepper(service, core, self.config.names) for service, core in self._pairs], self._take)
@@ -85,6 +86,8 @@ class Agent:
             self.plan = message
         elif topic == ACTION and isinstance(message, Action):
             self._action = message
+        elif topic == EVENTS and isinstance(message, Events):
+            self.events = message
         elif part is not None:
             kept: Mapping[Topic, dict] = {PERCEPT: self.percepts, GOAL_PERCEPT: self.goal_percepts,
                                           BELIEF: self.beliefs}

@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from saccade.services.belief.attitude import PoseLikeness, Views
 from saccade.services.belief.free_energy import crop_term, identity_term, likelihood_term, pose_term, position_term
+from saccade.services.belief.motion import Change, Motion
 from saccade.services.belief.pose import GoalView, LatentLikeness, Likeness, TurnLikeness
-from saccade.services.belief.position import PositionFilter, evidence_of
-from saccade.shared.bus.messages import Belief, Percept
-from saccade.shared.bus.topics import BELIEF, GOAL, GOAL_PERCEPT, PERCEPT, Output
+from saccade.services.belief.position import Evidence, PositionFilter, evidence_of, of_whole
+from saccade.shared.bus.messages import Belief, Events, Percept
+from saccade.shared.bus.topics import BELIEF, EVENTS, GOAL, GOAL_PERCEPT, PERCEPT, Output
 from saccade.shared.config import Config
 from saccade.shared.loop.seeding import generator
 from saccade.shared.loop.service import Inputs, Service
@@ -22,7 +23,7 @@ from saccade.shared.model.object_card import symmetries
 from saccade.shared.model.weights import WITH_LATENTS, Weights
 from saccade.shared.world.place import Place, place_of
 
-SERVICE = Service("belief", inputs=(PERCEPT, GOAL_PERCEPT, GOAL), trigger=PERCEPT, outputs=(BELIEF,))
+SERVICE = Service("belief", inputs=(PERCEPT, GOAL_PERCEPT, GOAL), trigger=PERCEPT, outputs=(BELIEF, EVENTS))
 
 Moments = tuple[NDArray[np.float64], NDArray[np.float64]]  # mean [3], covariance [3, 3]
 
@@ -59,6 +60,9 @@ class BeliefFilter:
         """Starts an episode. Nothing is known about its scene yet, and nothing is published."""
         self.episode = episode
         self.positions: dict[str, PositionFilter] = {}
+        self.motions = {name: Motion() for name in self.names}
+        self.since = dict.fromkeys(self.names, 0)
+        self.seen_last: set[str] = set()  # objects that were seen in the last image
         self.goal_views: dict[str, GoalView] = {}
         self.last_seen: dict[str, Percept] = {}
         self.goal_known = False
@@ -79,8 +83,11 @@ class BeliefFilter:
                 for name, goal in inputs["goal_percept"].items() if goal.presence > WORTH_COMPARING
                 for likeness in self._likeness(goal, place)}
         present = {name for name in self.names if percepts[name].presence > self.config.belief.present_above}
+        changes: dict[str, Change] = {}
         for name in self.names:
-            yield Output(BELIEF, self._update(name, percepts, present), name)
+            yield Output(BELIEF, self._update(name, percepts, present, changes), name)
+        self.seen_last = present
+        yield Output(EVENTS, _events(percepts[self.names[0]], changes))
 
     def _likeness(self, goal: Percept, place: Place | None) -> list[Likeness]:
         """How views of an object are compared with its percept in the goal image. Empty if they cannot be. In a place
@@ -92,16 +99,21 @@ class BeliefFilter:
         direct = self.config.belief.pose != "last"  # the paper's agent has the transition alone
         return [LatentLikeness(self.transitions[goal.object], goal, direct=direct)] if len(goal.latent_mean) else []
 
-    def _update(self, name: str, percepts: dict[str, Percept], present: set[str]) -> Belief:
+    def _update(self, name: str, percepts: dict[str, Percept], present: set[str],
+                changes: dict[str, Change]) -> Belief:
         percept, position = percepts[name], self.positions[name]
         rng = self._rng(percept.step, name)
         others = [(evidence_of(percepts[other]), self.radius_m[other]) for other in sorted(present - {name})]
+        self._carry(name, percept.step, rng)
         visible = position.visible(percept.world_from_camera, percept.intrinsics_px, others)
         before, prior = position.moments(), position.expected(visible)
         if name in present:
             position.seen(percept, rng)
         else:
             position.missed(visible, rng)
+        change = self._notice(name, percept, name in present, others, rng)
+        if change is not None:
+            changes[name] = change
         mean, covariance = position.moments()
         goal_view = self.goal_views.get(name)
         posterior, goal_range_m, goal_here = None, 0.0, 0.0
@@ -119,7 +131,36 @@ class BeliefFilter:
             particles_m=position.sample(self.config.belief.published_particles, rng).astype(np.float32),
             views=len(goal_view.keyframes) if goal_view else 0,
             goal_log_posterior=None if posterior is None else posterior.astype(np.float32),
-            goal_range_m=goal_range_m, goal_here=goal_here, **_told(goal_view.views if goal_view else None), **energy)
+            goal_range_m=goal_range_m, goal_here=goal_here,
+            velocity_m=self.motions[name].velocity_m, since_step=self.since[name],
+            **_told(goal_view.views if goal_view else None), **energy)
+
+    def _carry(self, name: str, step: int, rng: np.random.Generator) -> None:
+        """Moves the belief about an object that drifts on by one step."""
+        velocity_m = self.motions[name].velocity_m
+        if velocity_m is None:
+            return
+        self.positions[name].carried(velocity_m, name in self.seen_last, rng)
+        if name in self.goal_views:
+            self.goal_views[name].carried(velocity_m, step)
+
+    def _notice(self, name: str, percept: Percept, seen: bool, others: list[tuple[Evidence, float]],
+                rng: np.random.Generator) -> Change | None:
+        """What is noticed to have happened to an object. The belief about it then begins anew where it has to."""
+        motion, position = self.motions[name], self.positions[name]
+        clear = position.clear(motion.places, percept.world_from_camera, percept.intrinsics_px, others)
+        evidence = of_whole(percept, self.radius_m[name], others) if seen else None
+        change = motion.step(percept.step, evidence, percept.presence, clear)
+        if change is None:
+            return None
+        if change.kind == "gone":
+            position.lost(rng)
+        elif change.kind != "rests":
+            position.placed(change.place, change.covariance, rng)
+            self.since[name] = percept.step
+        if change.kind == "moved" and name in self.goal_views:
+            self.goal_views[name].forget()
+        return change
 
     def _free_energy(self, percept: Percept, prior: float, before: Moments, after: Moments,
                      present: bool) -> Energy:
@@ -151,6 +192,14 @@ def _told(views: Views | None) -> ToldViews:
     if views is None:
         return {}
     return {"goal_rotations": views.rotations, "goal_rotations_log_probability": views.log_probability}
+
+
+def _events(at: Percept, changes: dict[str, Change]) -> Events:
+    """The message of what was noticed with the image of a percept."""
+    return Events(run=at.run, episode=at.episode, step=at.step, objects=list(changes),
+                  kinds=[change.kind for change in changes.values()],
+                  positions_m=np.array([change.place for change in changes.values()]).reshape(-1, 3),
+                  probabilities=np.array([change.probability for change in changes.values()]))
 
 
 def build(config: Config) -> BeliefFilter:

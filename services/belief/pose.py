@@ -11,7 +11,7 @@ are fused over the turn of the object (`services/belief/turn.py`), or over all i
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -51,6 +51,7 @@ CERTAIN = 0.03  # chosen: the quality of a view is its presence / (this + standa
 NEAR_RAD = 0.35  # chosen: views within about this angle of the goal's likeliest direction count more
 NEAR_WEIGHT = 5.0  # chosen: what is added at most to the weight 1 of a view near the goal's likeliest direction
 SAME_SCALE = 0.3  # chosen: weight of the prior that the goal's range is as measured; one near view has at most 1
+FRESH_STEPS = 8  # chosen: views of a drifting object count for so many steps
 MOVED_M = 0.01  # chosen: if the object's position changes by more than this, all displacements are computed again
 
 
@@ -192,6 +193,20 @@ class GoalView:
             self.keyframes.remove(min(self.keyframes, key=lambda k: k.quality))
         self.keyframes.append(Keyframe(percept, quality, REFERENCE_RANGE_M / percept.scale,
                                        self.likeness.of(percept, self.center)))
+
+    def forget(self) -> None:
+        """Drops all views: the object was moved, so they say nothing of how it is turned now."""
+        self.keyframes, self.center = [], np.full(3, np.inf)
+
+    def carried(self, move_m: Array, step: int) -> None:
+        """Moves the kept views along with an object that drifts by `move_m` [3] (metres), as if they were one piece.
+        Views from long before `step` are dropped, because the object may turn while it drifts."""
+        self.center = self.center + move_m
+        self.keyframes = [k for k in self.keyframes if k.percept.step > step - FRESH_STEPS]
+        for keyframe in self.keyframes:
+            camera = keyframe.percept.world_from_camera.copy()
+            camera[:3, 3] += move_m
+            keyframe.percept = replace(keyframe.percept, world_from_camera=camera)
 
     def here(self, percept: Percept) -> float:
         """Probability, by the present view alone, that the goal image was taken from about this direction."""

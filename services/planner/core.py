@@ -18,6 +18,7 @@ from saccade.services.planner.free_energy import Terms, expected_free_energy
 from saccade.services.planner.goal import Preference, infer_preference
 from saccade.services.planner.goal_views import Side, goal_eye, goal_viewpoint, heading
 from saccade.services.planner.hand import Hand
+from saccade.services.planner.moving import OFTEN, ahead, carried, shifted
 from saccade.services.planner.place import Ground, PaperGround, Room, way_cost
 from saccade.shared.bus.messages import Action, Belief, Plan
 from saccade.shared.bus.topics import ACTION, BELIEF, GOAL, GOAL_PERCEPT, PLAN, Output
@@ -70,6 +71,8 @@ class Planner:
         self.hand = Hand(self.config.planner.replan_every) if self.moved_by == "hand" else None
         self.rivals = Rivals()
         self.wanted: Array | None = None  # the rival direction [3] from which the agent is about to look
+        self.since = 0  # the step since which the target is as it is
+        self.velocity_m: Array | None = None  # of the target, as believed [3]
         self.visited: list[Array] = []  # camera poses [4, 4] at which the agent has arrived in the mode "goal"
         return ()
 
@@ -87,6 +90,7 @@ class Planner:
             # A goal image that shows no known object sets no preference. The agent then explores.
             known = preference.confidence >= self.config.planner.goal_confidence
             self.preference = preference if known and not self.config.scene.explore else None
+        beliefs = self._follow(beliefs)
         spheres = self.obstacles(beliefs)
         ground = PaperGround(spheres) if self.room is None else self.room.among(self._boxes(beliefs))
         beliefs = self._refine(beliefs, ground)
@@ -94,6 +98,8 @@ class Planner:
         chosen, mode, eye = self.plan, self._mode(beliefs), self._believed_eye(beliefs, camera, ground)
         moved = self._moved if self.hand is None else self._followed
         due, declared = moved(chosen, mode, beliefs, camera, eye)
+        if chosen is not None:
+            chosen = self.plan = carried(chosen, self.velocity_m)
         if chosen is None or due:
             chosen = self.plan = self._choose(stamp, mode, beliefs, camera, ground)
             if self.hand is not None:
@@ -107,6 +113,22 @@ class Planner:
         yield Output(PLAN, plan)
         yield Output(ACTION, Action(run=plan.run, episode=plan.episode, step=plan.step, translation_m=translation,
                                     rotation_rad=rotation, arrived=declared))
+
+    def _follow(self, beliefs: dict[str, Belief]) -> dict[str, Belief]:
+        """Takes what happened to the target, and returns the beliefs as they will be at the next image.
+
+        What was tried before the target was moved says nothing any more. While it drifts, it moves along.
+        """
+        target = self.preference.target if self.preference else None
+        if target is None:
+            return beliefs
+        if beliefs[target].since_step > self.since:
+            self.since, self.plan = beliefs[target].since_step, None
+            self.rivals, self.wanted, self.visited = Rivals(), None, []
+        self.velocity_m = velocity_m = beliefs[target].velocity_m
+        if velocity_m is not None:
+            self.visited = [shifted(seen, velocity_m) for seen in self.visited]
+        return ahead(beliefs, target)
 
     def _refine(self, beliefs: dict[str, Belief], ground: Ground) -> dict[str, Belief]:
         """Takes the goal's range from the belief, which corrects it by the error that similar views have. Returns the
@@ -133,8 +155,13 @@ class Planner:
                 self._has_looked(target, camera, evidence.look,
                                  wrong=not evidence.rival or evidence.probability < UNLIKELY)
         self.age += 1
-        due = chosen is None or arrived or mode != chosen.mode or self.age >= self.config.planner.replan_every
+        due = chosen is None or arrived or mode != chosen.mode or self.age >= self._patience
         return due, declared
+
+    @property
+    def _patience(self) -> int:
+        """After how many steps a viewpoint is chosen anew."""
+        return self.config.planner.replan_every if self.velocity_m is None else OFTEN
 
     def _followed(self, chosen: Plan | None, mode: str, beliefs: dict[str, Belief], camera: Array,
                   eye: Array | None) -> tuple[bool, bool]:
@@ -176,7 +203,8 @@ class Planner:
             return success(camera, viewpoint)
         moved = _between(camera, self.before) if self.before is not None and self.age > 1 else (1.0, 1.0)
         near = _between(camera, viewpoint)
-        return (near[0] < ARRIVED_M and near[1] < ARRIVED_RAD) or (moved[0] < STUCK_M and moved[1] < ARRIVED_RAD)
+        within = ARRIVED_M if self.velocity_m is None else ARRIVED_M + float(np.linalg.norm(self.velocity_m))
+        return (near[0] < within and near[1] < ARRIVED_RAD) or (moved[0] < STUCK_M and moved[1] < ARRIVED_RAD)
 
     def _heading(self, camera: Array, plan: Plan, beliefs: dict[str, Belief]) -> Array:
         """The camera pose to move towards [4, 4].

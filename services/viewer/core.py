@@ -18,10 +18,10 @@ from saccade.services.viewer.guiding import Guiding
 from saccade.services.viewer.images import Images
 from saccade.services.viewer.imagination import Imagination
 from saccade.services.viewer.layout import STEP, Colour, colour_of, layout
-from saccade.services.viewer.words import decision, ending
+from saccade.services.viewer.words import decision, ending, happened
 from saccade.services.viewer.world import World
-from saccade.shared.bus.messages import Belief, Frame, Message, Percept, Plan, Result, Status, Truth
-from saccade.shared.bus.topics import BELIEF, FRAME, GOAL, PERCEPT, PLAN, RESULT, STATUS, TRUTH, Topic
+from saccade.shared.bus.messages import Belief, Events, Frame, Message, Percept, Plan, Result, Status, Truth
+from saccade.shared.bus.topics import BELIEF, EVENTS, FRAME, GOAL, PERCEPT, PLAN, RESULT, STATUS, TRUTH, Topic
 from saccade.shared.config import Config
 from saccade.shared.errors import SaccadeError
 from saccade.shared.loop.stepper import settle
@@ -73,7 +73,7 @@ class Viewer:
         self._curves = Curves(recording, tuple(self._names), self._colour_of)
         self._show: dict[Topic, Callable[[Any], None]] = {
             FRAME: self._frame, GOAL: self._images.goal, PERCEPT: self._percept, BELIEF: self._belief,
-            PLAN: self._plan, TRUTH: self._true, RESULT: self._result, STATUS: self._status}
+            EVENTS: self._events, PLAN: self._plan, TRUTH: self._true, RESULT: self._result, STATUS: self._status}
         self._episode, self._first, self._newest = -1, 0, 0  # its number, its start on the timeline, its last step
         self._frames: dict[int, Frame] = {}  # by step: the frames whose percepts have not arrived yet
         self._seen: Gathered[Percept] = Gathered()  # the percepts of the newest step that has any
@@ -200,6 +200,11 @@ class Viewer:
         if held.by_object:
             self._at(held.step)
             self._curves.beliefs(held.by_object)
+
+    def _events(self, events: Events) -> None:
+        self._world.events(events)
+        for text in happened(events):
+            self._to.log("decisions", rr.TextLog(text, level=rr.TextLogLevel.WARN))
 
     def _plan(self, plan: Plan) -> None:
         self._world.plan(plan)

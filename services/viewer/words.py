@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from saccade.shared.bus.messages import Belief, Plan, Result
+from saccade.shared.bus.messages import Belief, Events, Plan, Result
 
 SEEN = 0.5  # an object with at least this presence counts as seen
 NEAR_M = 0.10  # nearer than this to the goal's viewpoint the camera turns as planned
@@ -23,6 +23,16 @@ def decision(plan: Plan, beliefs: Iterable[Belief]) -> str:
     if 0 <= plan.believed_distance_m < NEAR_M:
         return f"centre the {plain(plan.target)} as in the goal"
     return f"approach: the goal's view of the {plain(plan.target)}"
+
+
+HAPPENED = {"moved": "was moved", "turned": "was turned", "gone": "is gone", "back": "is back", "drifts": "drifts",
+            "rests": "rests again"}
+
+
+def happened(events: Events) -> list[str]:
+    """What was noticed with one image, in words: a sentence for each event."""
+    return [f"the {plain(name)} {HAPPENED.get(kind, kind)} ({100 * probability:.0f} %)"
+            for name, kind, probability in zip(events.objects, events.kinds, events.probabilities, strict=False)]
 
 
 def ending(result: Result) -> str:

@@ -12,16 +12,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from saccade.services.viewer.layout import PATH, PLANNED, TABLE, TRUE, VIEW_PX, Colour, between
 from saccade.services.viewer.words import SEEN, plain
-from saccade.shared.bus.messages import Belief, Frame, Plan, Truth
+from saccade.shared.bus.messages import Belief, Events, Frame, Plan, Truth
 from saccade.shared.world.geometry import IMAGE_SIZE_PX, INTRINSICS_PX, quaternion
 from saccade.shared.world.task import LOWER_M, UPPER_M
 
 CAMERA, VIEWPOINT, GOAL, TRUTH = "world/camera", "world/viewpoint", "world/goal", "world/true"
-OF_EPISODE = ("world/objects", "world/path", "world/candidates", VIEWPOINT, GOAL, TRUTH)  # cleared in the next episode
+EVENTS = "world/events"
+# Cleared in the next episode
+OF_EPISODE = ("world/objects", "world/path", "world/candidates", VIEWPOINT, GOAL, TRUTH, EVENTS)
 FRUSTUM_M, PLANNED_M, GHOST_M = 0.10, 0.07, 0.04  # size of the cameras, and half size of an object of unknown size
 PATH_LENGTH = 500  # positions of the path that are shown: it is drawn at every step and must not grow with the run
 CHI_95 = 2.80  # a Gaussian in space is within this many standard deviations with probability 0.95
-PARTICLE_M, CANDIDATE_M = 0.0025, 0.006
+PARTICLE_M, CANDIDATE_M, EVENT_M = 0.0025, 0.006, 0.012
 UNSEEN_GREY = 110  # particles of an object that is believed absent fade towards this grey
 
 
@@ -78,6 +80,14 @@ class World:
         self._to.log(f"{path}/belief", rr.Ellipsoids3D.from_fields(
             centers=[belief.mean_m], half_sizes=[CHI_95 * np.sqrt(np.maximum(values, 1e-8))],
             quaternions=[rr.Quaternion(xyzw=quaternion(vectors))], **look))
+
+    def events(self, events: Events) -> None:
+        """Logs a mark where something was noticed, which stays until something else is."""
+        if events.objects:
+            self._to.log(EVENTS, rr.Points3D(
+                events.positions_m, radii=EVENT_M, colors=[self._colour_of(name) for name in events.objects],
+                labels=[f"{plain(name)}: {kind}" for name, kind in zip(events.objects, events.kinds, strict=False)],
+                show_labels=True))
 
     def plan(self, plan: Plan) -> None:
         """Logs the best candidates (the very best is green), and the chosen viewpoint as a camera."""

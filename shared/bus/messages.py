@@ -173,6 +173,11 @@ class Belief(Message):
     if the object may lie and the goal's camera may have been rolled; otherwise the direction says it."""
     goal_rotations_log_probability: Annotated[np.ndarray, array("f8", "G")] | None = None
     """Their log probabilities."""
+    velocity_m: Annotated[np.ndarray, array("f8", 3)] | None = None
+    """Its velocity (world), metres a step. Absent while it is believed to rest."""
+    since_step: int = 0
+    """Step since which it is believed to be as it is: at which it was last noticed to be moved, turned or back. 0 if
+    nothing has happened to it."""
     f_pose: float = 0.0
     """Term of the variational free energy (paper, appendix A), nats: the latent pose."""
     f_identity: float = 0.0
@@ -188,6 +193,21 @@ class Belief(Message):
     def free_energy(self) -> float:
         """Variational free energy F of this object at this step, nats (paper, appendix A): the sum of its terms."""
         return self.f_pose + self.f_identity + self.f_crop + self.f_position + self.f_likelihood
+
+
+@dataclass(frozen=True, kw_only=True)
+class Events(Message):
+    """What the belief noticed with one image: objects that are not where they were, or not as they were. Mostly there
+    are none."""
+
+    objects: list[str]
+    """Names of the objects, one for each event."""
+    kinds: list[str]
+    """What happened to each: `moved`, `turned`, `gone`, `back`, `drifts`, or `rests` after it has drifted."""
+    positions_m: Annotated[np.ndarray, array("f8", "N", 3)]
+    """Where each is believed to be now; of one that is gone, where it was."""
+    probabilities: Annotated[np.ndarray, array("f8", "N")]
+    """Probability of each event, by what was seen."""
 
 
 @dataclass(frozen=True, kw_only=True)

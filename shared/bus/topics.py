@@ -20,7 +20,7 @@ class Topic(Generic[Of]):
 
     `parts`: the topic has one key for each object, or for each service in the case of `status`. `latched`: it has one
     message per episode, which holds for every later step. `in_step`: it is published once per step (and part), so that
-    a gap can be noticed.
+    a gap can be noticed. `optional`: no service needs it, so a service of one's own may leave it out.
     """
 
     name: str
@@ -28,6 +28,7 @@ class Topic(Generic[Of]):
     parts: bool = False
     latched: bool = False
     in_step: bool = True
+    optional: bool = False
 
     def key(self, world: str, part: str | None = None) -> str:
         """Returns the key `saccade/<world>/<topic>`, with `/<part>` if the topic has parts. Without `part` it is the
@@ -49,6 +50,7 @@ GOAL = Topic("goal", m.Goal, latched=True)
 PERCEPT = Topic("percept", m.Percept, parts=True)
 GOAL_PERCEPT = Topic("goal_percept", m.Percept, parts=True, latched=True)
 BELIEF = Topic("belief", m.Belief, parts=True)
+EVENTS = Topic("events", m.Events, optional=True)
 PLAN = Topic("plan", m.Plan)
 ACTION = Topic("action", m.Action)
 TRUTH = Topic("truth", m.Truth)
@@ -56,7 +58,8 @@ RESULT = Topic("result", m.Result, latched=True)
 STATUS = Topic("status", m.Status, parts=True, in_step=False)
 
 TOPICS: dict[str, Topic] = {topic.name: topic for topic in (
-    FRAME, GOAL, PERCEPT, GOAL_PERCEPT, BELIEF, PLAN, ACTION, TRUTH, RESULT, STATUS)}
+    FRAME, GOAL, PERCEPT, GOAL_PERCEPT, BELIEF, EVENTS, PLAN, ACTION, TRUTH, RESULT,
+    STATUS)}
 
 
 def parse_key(key: str) -> tuple[str, Topic, str | None]:

@@ -23,6 +23,8 @@ Change = Callable[[Topic, str | None, Fields], Fields]
 OLDEST = 1  # the format of logs that do not name one
 ADDED = {m.Percept: ("mask_bits",), m.Plan: ("best_eyes_m", "best_g")}  # fields that older logs lack; they become None
 
+SINCE = {"events": 7}  # topics that older formats do not have, and the format since which they exist
+
 
 def count_in_episodes() -> Change:
     """Format 1 to 2: sequence numbers count from 0 in every episode, no longer through the whole run."""
@@ -78,18 +80,20 @@ def with_places_and_instances() -> Change:
     return change
 
 
-def with_rolled_goals() -> Change:
-    """Format 6 to 7: a belief may tell how the goal's camera was rolled."""
+def with_motion_and_rolls() -> Change:
+    """Format 6 to 7: a belief may tell how the goal's camera was rolled, and how an object moves. The topic `events` is
+    new."""
+    added: dict[type[m.Message], Fields] = {m.Belief: {
+        "version": 2, "goal_rotations": None, "goal_rotations_log_probability": None, "velocity_m": None, "since_step": 0}}
+
     def change(topic: Topic, part: str | None, fields: Fields) -> Fields:
-        if topic.type is not m.Belief:
-            return fields
-        return fields | {"version": 2} | dict.fromkeys(("goal_rotations", "goal_rotations_log_probability"))
+        return fields | added.get(topic.type, {})
 
     return change
 
 
 CHANGES: tuple[Callable[[], Change], ...] = (count_in_episodes, with_masks_and_candidates, with_poses,
-                                             with_several_rotations, with_places_and_instances, with_rolled_goals)
+                                             with_several_rotations, with_places_and_instances, with_motion_and_rolls)
 FORMAT = OLDEST + len(CHANGES)
 
 

@@ -93,7 +93,8 @@ def _require_alike(told: str, service: Service, ours: Service) -> None:
     SaccadeError if one of them does not fit."""
     if service.name != ours.name:
         raise SaccadeError(f"{told} calls itself {service.name!r}: it stands in the place of {ours.name!r}, call it so")
-    if set(service.outputs) != set(ours.outputs):
+    left_out = set(ours.outputs) - set(service.outputs)
+    if not set(service.outputs) <= set(ours.outputs) or not all(topic.optional for topic in left_out):
         raise SaccadeError(f"{told} declares the outputs {_names(service.outputs)}: the {ours.name} has "
                            f"{_names(ours.outputs)}")
     if service.trigger not in service.inputs:
