@@ -113,7 +113,7 @@ class BeliefFilter:
             particles_m=position.sample(self.config.belief.published_particles, rng).astype(np.float32),
             views=len(goal_view.keyframes) if goal_view else 0,
             goal_log_posterior=None if posterior is None else posterior.astype(np.float32),
-            goal_range_m=goal_range_m, goal_here=goal_here, **energy)
+            goal_range_m=goal_range_m, goal_here=goal_here, goal_agreement=percept.goal_agreement, **energy)
 
     def _free_energy(self, percept: Percept, prior: float, before: Moments, after: Moments,
                      present: bool) -> Energy:

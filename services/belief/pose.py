@@ -16,6 +16,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from saccade.services.belief.looks import Looks
 from saccade.services.belief.turn import GoalDirections, turn_probability
 from saccade.shared.bus.messages import Percept
 from saccade.shared.config import BeliefConfig
@@ -155,6 +156,7 @@ class GoalView:
         elevation, azimuth = viewing_grid()
         self.elevation, self.azimuth = (x.ravel() for x in np.meshgrid(elevation, azimuth, indexing="ij"))
         self.keyframes: list[Keyframe] = []
+        self.looks = Looks(symmetry)
         self.center = np.full(3, np.inf)  # last believed position of the object; none yet
 
     def seen(self, percept: Percept, center: Array) -> None:
@@ -169,6 +171,8 @@ class GoalView:
         if self.config.pose == "last":
             self.keyframes = []
         eye = percept.world_from_camera[:3, 3]
+        if percept.goal_agreement is not None:
+            self.looks.take(eye, self.center, percept.goal_agreement)
         quality = percept.presence / (CERTAIN + percept.log_scale_std)
         near = [k for k in self.keyframes if _angle(k.eye, eye, self.center) < NEW_VIEW_RAD]
         if near and max(k.quality for k in near) * BETTER > quality:
@@ -190,12 +194,18 @@ class GoalView:
     def log_posterior(self) -> Array | None:
         """Log probabilities of the directions of the grid, normalised [E, A]. None before the first view.
 
-        The views are fused twice. The second time, views near the peak of the first result count more.
+        The views are fused twice. The second time, views near the peak of the first result count more. What comparisons
+        with the goal image say is multiplied.
         """
         if not self.keyframes:
             return None
         first = self._fuse(np.ones(len(self.keyframes)))
-        return self._fuse(1.0 + NEAR_WEIGHT * self._nearness(first))
+        fused = self._fuse(1.0 + NEAR_WEIGHT * self._nearness(first))
+        compared = self.looks.log_ratio(self.center)
+        if compared is None:
+            return fused
+        total = fused + compared - (fused + compared).max()
+        return np.asarray(total - np.log(np.exp(total).sum()))
 
     def _fuse(self, weights: Array) -> Array:
         # Views are not independent, and they share the error of the goal's percept: together they count as a few views.

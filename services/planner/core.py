@@ -167,7 +167,7 @@ class Planner:
         fused = fused_here(target, camera, self.symmetry[target.object])
         return Evidence(target.goal_here, fused,
                         self.rivals.beside(camera, target.mean_m) is not None,
-                        self.rivals.elsewhere(camera, target.mean_m))
+                        self.rivals.elsewhere(camera, target.mean_m), target.goal_agreement is not None)
 
     def _has_looked(self, target: Belief, camera: Array, look: float, *, wrong: bool) -> None:
         """The agent has arrived and looked, and goes on: to a rival, if the view may be the goal's all the same."""

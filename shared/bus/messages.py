@@ -98,7 +98,7 @@ class Percept(Message):
     """What the networks of one object made of one image (paper, section 3.2), on `percept` and `goal_percept`. On
     `goal_percept` the camera's pose is unknown: the identity stands for it."""
 
-    VERSION: ClassVar[int] = 4
+    VERSION: ClassVar[int] = 5
 
     object: str
     """Name of the object."""
@@ -133,6 +133,9 @@ class Percept(Message):
     """Their log probabilities."""
     deviation_rad: Annotated[np.ndarray, array("f8", "R")] | None = None
     """Their standard deviations, radians."""
+    goal_agreement: float | None = None
+    """Share of the object's local features that agree with those in the goal image, where both are compared: where the
+    object is about as large and about at the same place in the image."""
 
     def mask(self) -> np.ndarray | None:
         """Where in the image the object is seen: truth values [M, M]. None if the message has no mask."""
@@ -144,6 +147,8 @@ class Percept(Message):
 @dataclass(frozen=True, kw_only=True)
 class Belief(Message):
     """The posterior over one object: where it is, and from where it would look like the goal."""
+
+    VERSION: ClassVar[int] = 2
 
     object: str
     """Name of the object."""
@@ -166,6 +171,9 @@ class Belief(Message):
     """Range at which the goal image shows the object, by the measure of similar views. 0 without a posterior."""
     goal_here: float = 0.0
     """Probability, by the present view alone, that the goal image was taken from about this direction."""
+    goal_agreement: float | None = None
+    """Share of the local features of the present view that agree with those of the goal image, where both are compared.
+    The posterior takes it into account."""
     f_pose: float = 0.0
     """Term of the variational free energy (paper, appendix A), nats: the latent pose."""
     f_identity: float = 0.0

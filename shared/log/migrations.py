@@ -78,8 +78,20 @@ def with_places_and_instances() -> Change:
     return change
 
 
+def with_agreement() -> Change:
+    """Format 6 to 7: percepts and beliefs may tell how well the present view agrees with the goal image."""
+    versions: dict[type[m.Message], int] = {m.Percept: 5, m.Belief: 2}
+
+    def change(topic: Topic, part: str | None, fields: Fields) -> Fields:
+        if topic.type not in versions:
+            return fields
+        return fields | {"version": versions[topic.type], "goal_agreement": None}
+
+    return change
+
+
 CHANGES: tuple[Callable[[], Change], ...] = (count_in_episodes, with_masks_and_candidates, with_poses,
-                                             with_several_rotations, with_places_and_instances)
+                                             with_several_rotations, with_places_and_instances, with_agreement)
 FORMAT = OLDEST + len(CHANGES)
 
 

@@ -1,0 +1,97 @@
+"""Whether an image shows an object as the goal image does, at the resolution that is there.
+
+Latent poses hold crops of 64 pixels, and the front and the back of a label may look alike in them. So the goal's object
+is also compared by local features (`local_features.py`), where the goal's view may be: where it is about as large and
+about at the same place in the image. Features of both crops that are alike belong together, and in views from the same
+direction nearly all of these pairs follow from one affine map that is not far from the identity.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+from saccade.services.perception.cropping import Cropper
+from saccade.services.perception.local_features import Features, LocalFeatures, mutual
+from saccade.services.perception.seen import Seen
+from saccade.shared.bus.messages import mask_of
+from saccade.shared.world.geometry import pixel_rays, unit
+from saccade.shared.world.windows import Window
+
+SIDE_PX = 256  # of the crops that are compared
+MOST = 400  # local features of a crop
+SHOWN = 0.5  # chosen: objects with a lower presence are not compared
+ASIDE_RAD, LARGER = 0.25, 0.35  # chosen: how far from the goal's place, and by what logarithm larger, an object may be
+MARGIN_PX = 4  # chosen: features within this of the object's mask are its own
+FEWEST = 3  # pairs that tell an affine map
+SHIFTED = 0.12  # chosen: pairs that begin are shifted like their median, to this share of the crop's side
+WITHIN = (0.08, 0.05, 0.03, 0.02, 0.02)  # chosen: the same for pairs that follow the map, from fit to fit
+
+
+class SameView:
+    """Compares images with one goal image, in which objects with crops of `sides_m` [K] (metres) were `seen`.
+
+    Raises SaccadeError if the local features cannot be had.
+    """
+
+    def __init__(self, features: LocalFeatures, sides_m: ArrayLike, rgb: NDArray[np.uint8], intrinsics_px: ArrayLike,
+                 up: ArrayLike, seen: Seen):
+        self._features, self._sides_m = features, np.asarray(sides_m, dtype=np.float64)
+        self._intrinsics_px, self._seen = np.asarray(intrinsics_px), seen
+        self._shown = {k: self._of(k, rgb, intrinsics_px, up, seen) for k in np.flatnonzero(seen.presence > SHOWN)}
+
+    def agreement(self, k: int, rgb: NDArray[np.uint8], intrinsics_px: ArrayLike, up: ArrayLike,
+                  seen: Seen) -> float | None:
+        """The share (0 to 1) of the local features of object `k` that agree, of those in the crop that has fewer. None
+        if an image [H, W, 3] is not compared."""
+        if k not in self._shown or seen.presence[k] < SHOWN or not self._may_be_same(k, intrinsics_px, seen):
+            return None
+        there, here = self._shown[k], self._of(k, rgb, intrinsics_px, up, seen)
+        fewer = min(len(there.pixels), len(here.pixels))
+        if fewer < FEWEST:
+            return None
+        rows, columns = mutual(there.descriptors @ here.descriptors.T)
+        return following(*((each.double().numpy() / SIDE_PX) for each in
+                           (there.pixels[rows], here.pixels[columns]))) / fewer
+
+    def _may_be_same(self, k: int, intrinsics_px: ArrayLike, seen: Seen) -> bool:
+        here, there = (unit(pixel_rays(one.pixel[k], px)) for one, px in
+                       ((seen, intrinsics_px), (self._seen, self._intrinsics_px)))
+        larger = np.log(seen.scale[k] / self._seen.scale[k])
+        return bool(here @ there > np.cos(ASIDE_RAD) and abs(larger) < LARGER)
+
+    @torch.inference_mode()
+    def _of(self, k: int, rgb: NDArray[np.uint8], intrinsics_px: ArrayLike, up: ArrayLike, seen: Seen) -> Features:
+        """The local features of an object."""
+        image = torch.from_numpy(np.array(rgb)).permute(2, 0, 1).float() / 255.0
+        mask = torch.from_numpy(mask_of(seen.mask_bits[k])).float()[None]
+        cropper = Cropper(image, mask, intrinsics_px, up)
+        window = Window(seen.pixel[k, None], seen.scale[k, None], self._sides_m[k, None])
+        found = self._features(cropper.fine(window, SIDE_PX), MOST)[0]
+        own = _widened(cropper.mask(window, SIDE_PX)[0])
+        column, row = found.pixels.long().clamp(0, SIDE_PX - 1).T
+        inside = own[row, column]
+        return Features(found.pixels[inside], found.descriptors[inside])
+
+
+def _widened(mask: Tensor) -> Tensor:
+    """Where a mask [S, S] holds or is near (truth values)."""
+    side = 2 * MARGIN_PX + 1
+    return torch.nn.functional.max_pool2d(mask[None], side, 1, MARGIN_PX)[0] > 0.3
+
+
+def following(there: NDArray[np.float64], here: NDArray[np.float64]) -> int:
+    """How many pairs of places [M, 2] in two crops (shares of the side) follow from one affine map, which is fitted
+    anew to those that follow it, beginning with those that are shifted alike."""
+    if len(there) < FEWEST:
+        return 0
+    places, shift = np.column_stack([there, np.ones(len(there))]), here - there
+    follow = np.linalg.norm(shift - np.median(shift, axis=0), axis=1) < SHIFTED
+    for within in WITHIN:
+        if follow.sum() < FEWEST:
+            return 0
+        affine = np.linalg.lstsq(places[follow], here[follow], rcond=None)[0]
+        follow = np.linalg.norm(places @ affine - here, axis=1) < within
+    return int(follow.sum())
