@@ -15,7 +15,7 @@ from saccade.shared.bus.messages import Belief
 from saccade.shared.world.directions import alike
 from saccade.shared.world.geometry import Array, direction, unit, viewing_grid
 
-CERTAIN = 0.9  # chosen: where the view is compared with the goal image, the posterior must be so sure
+CERTAIN = 0.9  # chosen: beside a rival, the posterior with the comparison of this view must be so sure
 SURE = 0.6  # chosen: the agent says so if looks and fused views together leave at least this probability
 UNLIKELY = 0.25  # chosen: a view that has a lower probability is not the goal's
 CLEAR = 0.93  # chosen: looks that are clearer than this need no look at rivals; a view that may be wrong reaches 0.95
@@ -46,7 +46,7 @@ class Evidence(NamedTuple):
     def is_enough(self) -> bool:
         """Whether the agent says that the camera is there."""
         if self.compared:
-            return self.probability > CERTAIN
+            return self.probability > (CERTAIN if self.rival else SURE)
         return self.probability > SURE and (self.look > CLEAR or not self.rival)
 
 
