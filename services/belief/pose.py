@@ -49,6 +49,7 @@ BETTER = 1.2  # chosen: a view replaces the same kept view if its quality is hig
 CERTAIN = 0.03  # chosen: the quality of a view is its presence / (this + standard deviation of its log scale)
 NEAR_RAD = 0.35  # chosen: views within about this angle of the goal's likeliest direction count more
 NEAR_WEIGHT = 5.0  # chosen: what is added at most to the weight 1 of a view near the goal's likeliest direction
+UNSURE = 0.1  # chosen: probability that the views without comparisons say nothing of the goal's direction
 SAME_SCALE = 0.3  # chosen: weight of the prior that the goal's range is as measured; one near view has at most 1
 MOVED_M = 0.01  # chosen: if the object's position changes by more than this, all displacements are computed again
 
@@ -172,7 +173,8 @@ class GoalView:
             self.keyframes = []
         eye = percept.world_from_camera[:3, 3]
         if percept.goal_agreement is not None:
-            self.looks.take(eye, self.center, percept.goal_agreement)
+            farther = percept.scale * self.measured_range_m / REFERENCE_RANGE_M
+            self.looks.take(eye, self.center, percept.goal_agreement, farther, percept.goal_roll_rad or 0.0)
         quality = percept.presence / (CERTAIN + percept.log_scale_std)
         near = [k for k in self.keyframes if _angle(k.eye, eye, self.center) < NEW_VIEW_RAD]
         if near and max(k.quality for k in near) * BETTER > quality:
@@ -204,7 +206,9 @@ class GoalView:
         compared = self.looks.log_ratio(self.center)
         if compared is None:
             return fused
-        total = fused + compared - (fused + compared).max()
+        share = (1 - UNSURE) * np.exp(fused) + UNSURE / fused.size
+        total = np.log(share) + compared
+        total -= total.max()
         return np.asarray(total - np.log(np.exp(total).sum()))
 
     def _fuse(self, weights: Array) -> Array:
@@ -226,10 +230,13 @@ class GoalView:
         """Range (m) at which the goal image shows the object.
 
         It is the measured range, corrected by the error that the same networks make in views from about the goal's
-        direction. With `belief.pose=last` it is not corrected.
+        direction. With `belief.pose=last` it is not corrected. A view that agrees with the goal image tells it best.
         """
         if self.config.pose == "last":
             return self.measured_range_m
+        compared_m = self.looks.range_m(self.center)
+        if compared_m is not None:
+            return compared_m
         weights = self._nearness(log_posterior)
         ratios = np.log([np.linalg.norm(k.eye - self.center) / k.range_m for k in self.keyframes])
         return float(self.measured_range_m * np.exp(weights @ ratios / (weights.sum() + SAME_SCALE)))

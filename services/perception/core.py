@@ -17,7 +17,7 @@ from saccade.services.perception.networks import INPUT_PX, Extraction, Identity,
 from saccade.services.perception.open_world import open_world_of
 from saccade.services.perception.paper import PaperSceneCCN
 from saccade.services.perception.posecnn import PoseCNN
-from saccade.services.perception.same_view import SameView
+from saccade.services.perception.same_view import Agreement, SameView
 from saccade.services.perception.seen import Seen, bits
 from saccade.shared.bus.messages import Frame, Goal, Percept
 from saccade.shared.bus.topics import FRAME, GOAL, GOAL_PERCEPT, PERCEPT, Output
@@ -159,10 +159,15 @@ class Perception:
             yield from self._goal(model, inputs["goal"])
         seen = self._seen(model, frame)
         for k, name in enumerate(self.names):
-            agreement = None if self.same_view is None else self.same_view.agreement(
-                k, frame.rgb, frame.intrinsics_px, frame.world_from_camera[2, :3], seen)
-            yield Output(PERCEPT, replace(percept(frame, name, seen, k, frame.world_from_camera),
-                                          goal_agreement=agreement), name)
+            told, agrees = percept(frame, name, seen, k, frame.world_from_camera), self._agreement(k, frame, seen)
+            if agrees is not None:
+                told = replace(told, goal_agreement=agrees.share, goal_roll_rad=agrees.roll_rad)
+            yield Output(PERCEPT, told, name)
+
+    def _agreement(self, k: int, frame: Frame, seen: Seen) -> Agreement | None:
+        if self.same_view is None:
+            return None
+        return self.same_view(k, frame.rgb, frame.intrinsics_px, frame.world_from_camera[2, :3], seen)
 
     def _seen(self, model: Model, frame: Frame) -> Seen:
         if self._last is None or not _same_view(self._last[0], frame):

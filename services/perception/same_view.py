@@ -8,6 +8,8 @@ direction nearly all of these pairs follow from one affine map that is not far f
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
@@ -30,6 +32,14 @@ SHIFTED = 0.12  # chosen: pairs that begin are shifted like their median, to thi
 WITHIN = (0.08, 0.05, 0.03, 0.02, 0.02)  # chosen: the same for pairs that follow the map, from fit to fit
 
 
+class Agreement(NamedTuple):
+    """The share (0 to 1) of an object's local features that agree, of those in the crop that has fewer, and by what
+    angle they are turned to the right against the goal image."""
+
+    share: float
+    roll_rad: float
+
+
 class SameView:
     """Compares images with one goal image, in which objects with crops of `sides_m` [K] (metres) were `seen`.
 
@@ -42,10 +52,9 @@ class SameView:
         self._intrinsics_px, self._seen = np.asarray(intrinsics_px), seen
         self._shown = {k: self._of(k, rgb, intrinsics_px, up, seen) for k in np.flatnonzero(seen.presence > SHOWN)}
 
-    def agreement(self, k: int, rgb: NDArray[np.uint8], intrinsics_px: ArrayLike, up: ArrayLike,
-                  seen: Seen) -> float | None:
-        """The share (0 to 1) of the local features of object `k` that agree, of those in the crop that has fewer. None
-        if an image [H, W, 3] is not compared."""
+    def __call__(self, k: int, rgb: NDArray[np.uint8], intrinsics_px: ArrayLike, up: ArrayLike,
+                 seen: Seen) -> Agreement | None:
+        """How an image [H, W, 3] agrees with the goal image on object `k`. None if they are not compared."""
         if k not in self._shown or seen.presence[k] < SHOWN or not self._may_be_same(k, intrinsics_px, seen):
             return None
         there, here = self._shown[k], self._of(k, rgb, intrinsics_px, up, seen)
@@ -53,8 +62,9 @@ class SameView:
         if fewer < FEWEST:
             return None
         rows, columns = mutual(there.descriptors @ here.descriptors.T)
-        return following(*((each.double().numpy() / SIDE_PX) for each in
-                           (there.pixels[rows], here.pixels[columns]))) / fewer
+        count, roll_rad = following(*((each.double().numpy() / SIDE_PX) for each in
+                                      (there.pixels[rows], here.pixels[columns])))
+        return Agreement(count / fewer, roll_rad)
 
     def _may_be_same(self, k: int, intrinsics_px: ArrayLike, seen: Seen) -> bool:
         here, there = (unit(pixel_rays(one.pixel[k], px)) for one, px in
@@ -82,16 +92,20 @@ def _widened(mask: Tensor) -> Tensor:
     return torch.nn.functional.max_pool2d(mask[None], side, 1, MARGIN_PX)[0] > 0.3
 
 
-def following(there: NDArray[np.float64], here: NDArray[np.float64]) -> int:
-    """How many pairs of places [M, 2] in two crops (shares of the side) follow from one affine map, which is fitted
-    anew to those that follow it, beginning with those that are shifted alike."""
+def following(there: NDArray[np.float64], here: NDArray[np.float64]) -> tuple[int, float]:
+    """How many pairs of places [M, 2] in two crops (shares of the side) follow from one affine map, and by what angle
+    (rad) it turns them to the right.
+
+    The map is fitted anew to those that follow it, beginning with those that are shifted alike.
+    """
     if len(there) < FEWEST:
-        return 0
+        return 0, 0.0
     places, shift = np.column_stack([there, np.ones(len(there))]), here - there
     follow = np.linalg.norm(shift - np.median(shift, axis=0), axis=1) < SHIFTED
     for within in WITHIN:
         if follow.sum() < FEWEST:
-            return 0
+            return 0, 0.0
         affine = np.linalg.lstsq(places[follow], here[follow], rcond=None)[0]
         follow = np.linalg.norm(places @ affine - here, axis=1) < within
-    return int(follow.sum())
+    (xx, xy), (yx, yy) = affine[:2]
+    return int(follow.sum()), float(np.arctan2(xy - yx, xx + yy))

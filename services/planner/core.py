@@ -47,6 +47,7 @@ FOUND_M = 0.06  # chosen: the target counts as found if the deviation of its pos
 KNOWN_M = 0.10  # chosen: an object becomes an obstacle if the deviation of its position is below this
 ARRIVED_M = 0.01  # chosen: the camera has arrived if it is within this distance of its viewpoint and within ARRIVED_RAD
 ARRIVED_RAD = 0.05  # chosen: the camera has arrived if it is within this angle of its viewpoint and within ARRIVED_M
+THERE_M = 0.04  # chosen: a view that was compared is the goal's if the goal's is believed to be within this of it
 STUCK_M = 0.002  # chosen: a camera that moves less than this in a step counts as arrived, because it cannot come nearer
 TURN_M = 0.10  # chosen: nearer than this to its viewpoint the camera turns as planned; before, it looks at the target
 NEARER = 0.3  # chosen: nats per metre of distance, so that the nearest of equally informative viewpoints is taken
@@ -84,6 +85,7 @@ class Planner:
         self.hand = Hand(self.config.planner.replan_every) if self.moved_by == "hand" else None
         self.rivals = Rivals()
         self.wanted: Array | None = None  # the rival direction [3] from which the agent is about to look
+        self.is_near = False  # the goal's view is sure to be near, and the agent goes to where it is believed to be
         self.visited: list[Array] = []  # camera poses [4, 4] at which the agent has arrived in the mode "goal"
         return ()
 
@@ -104,7 +106,7 @@ class Planner:
         spheres = self.obstacles(beliefs)
         chosen, mode, eye = self.plan, self._mode(beliefs), self._believed_eye(beliefs, camera, spheres)
         moved = self._moved if self.hand is None else self._followed
-        due, declared = moved(chosen, mode, beliefs, camera, eye)
+        due, declared = moved(chosen, mode, beliefs, camera, None if eye is None else clip(eye, spheres))
         if chosen is None or due:
             chosen = self.plan = self._choose(stamp, mode, beliefs, camera, spheres)
             if self.hand is not None:
@@ -135,9 +137,11 @@ class Planner:
                 declared = target.goal_here > SURE_ALONE
             else:
                 evidence = self._evidence(target, camera)
-                declared = evidence.is_enough
-                self._has_looked(target, camera, evidence.look,
-                                 wrong=not evidence.rival or evidence.probability < UNLIKELY)
+                self.is_near = evidence.is_enough
+                declared = evidence.is_enough and self._is_at(eye, camera, evidence)
+                if not self.is_near:
+                    self._has_looked(target, camera, evidence.look,
+                                     wrong=not evidence.rival or evidence.probability < UNLIKELY)
         self.age += 1
         due = chosen is None or arrived or mode != chosen.mode or self.age >= self.config.planner.replan_every
         return due, declared
@@ -168,6 +172,10 @@ class Planner:
         return Evidence(target.goal_here, fused,
                         self.rivals.beside(camera, target.mean_m) is not None,
                         self.rivals.elsewhere(camera, target.mean_m), target.goal_agreement is not None)
+
+    def _is_at(self, eye: Array | None, camera: Array, evidence: Evidence) -> bool:
+        """Whether the camera is where the goal's view is believed to be, `eye` [3], now that it was compared."""
+        return eye is None or not evidence.compared or bool(np.linalg.norm(eye - camera[:3, 3]) < THERE_M)
 
     def _has_looked(self, target: Belief, camera: Array, look: float, *, wrong: bool) -> None:
         """The agent has arrived and looked, and goes on: to a rival, if the view may be the goal's all the same."""
@@ -232,7 +240,8 @@ class Planner:
             cost = cost + self._visited_cost(eyes, self._side(beliefs[found.target], eyes[-1]))
         else:  # of equally informative viewpoints the nearest is taken
             cost = terms.total + NEARER * np.linalg.norm(eyes - camera[:3, 3], axis=1)
-        chosen = int(np.argmin(cost)) if self.wanted is None or best is None else len(eyes) - 1
+        leads = best is not None and (self.wanted is not None or self.is_near)
+        chosen = len(eyes) - 1 if leads else int(np.argmin(cost))
         if found is None or best is None:
             viewpoint = look_at(clip(eyes[chosen], spheres), gazes[chosen])
         elif chosen == len(eyes) - 1:

@@ -80,12 +80,12 @@ def with_places_and_instances() -> Change:
 
 def with_agreement() -> Change:
     """Format 6 to 7: percepts and beliefs may tell how well the present view agrees with the goal image."""
-    versions: dict[type[m.Message], int] = {m.Percept: 5, m.Belief: 2}
+    added: dict[type[m.Message], Fields] = {
+        m.Percept: {"version": 5, "goal_agreement": None, "goal_roll_rad": None},
+        m.Belief: {"version": 2, "goal_agreement": None}}
 
     def change(topic: Topic, part: str | None, fields: Fields) -> Fields:
-        if topic.type not in versions:
-            return fields
-        return fields | {"version": versions[topic.type], "goal_agreement": None}
+        return fields | added.get(topic.type, {})
 
     return change
 
