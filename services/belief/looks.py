@@ -19,8 +19,8 @@ Array = NDArray[np.float64]
 
 # Fitted to views of 150 development scenes: log of how much likelier an agreement is from the goal's direction
 # than from elsewhere.
-PER_AGREEMENT, WITHOUT = 13.0, -4.3
-AROUND_RAD = 0.2  # chosen: a comparison counts for directions within about this angle
+PER_AGREEMENT, WITHOUT = 18.0, -6.5
+AROUND_RAD = 0.15  # chosen: a comparison counts for directions within about this angle
 FROM_ABOVE_RAD = 0.8  # chosen: from a higher elevation the turn of the image tells the goal's azimuth
 SAME_RAD = 0.08  # chosen: of comparisons from within this angle the last counts
 

@@ -171,11 +171,11 @@ class Planner:
         fused = fused_here(target, camera, self.symmetry[target.object])
         return Evidence(target.goal_here, fused,
                         self.rivals.beside(camera, target.mean_m) is not None,
-                        self.rivals.elsewhere(camera, target.mean_m), target.goal_agreement is not None)
+                        self.rivals.elsewhere(camera, target.mean_m), target.goal_agreement)
 
     def _is_at(self, eye: Array | None, camera: Array, evidence: Evidence) -> bool:
         """Whether the camera is where the goal's view is believed to be, `eye` [3], now that it was compared."""
-        return eye is None or not evidence.compared or bool(np.linalg.norm(eye - camera[:3, 3]) < THERE_M)
+        return eye is None or evidence.agreement is None or bool(np.linalg.norm(eye - camera[:3, 3]) < THERE_M)
 
     def _has_looked(self, target: Belief, camera: Array, look: float, *, wrong: bool) -> None:
         """The agent has arrived and looked, and goes on: to a rival, if the view may be the goal's all the same."""
