@@ -25,7 +25,7 @@ from saccade.shared.world.windows import Window
 SIDE_PX = 256  # of the crops that are compared
 MOST = 400  # local features of a crop
 SHOWN = 0.5  # chosen: objects with a lower presence are not compared
-ASIDE_RAD, LARGER = 0.25, 0.35  # chosen: how far from the goal's place, and by what logarithm larger, an object may be
+ASIDE_RAD, LARGER = 0.15, 0.25  # chosen: how far from the goal's place, and by what logarithm larger, an object may be
 MARGIN_PX = 4  # chosen: features within this of the object's mask are its own
 FEWEST = 3  # pairs that tell an affine map
 SHIFTED = 0.12  # chosen: pairs that begin are shifted like their median, to this share of the crop's side

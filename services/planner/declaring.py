@@ -15,7 +15,7 @@ from saccade.shared.bus.messages import Belief
 from saccade.shared.world.directions import alike
 from saccade.shared.world.geometry import Array, direction, unit, viewing_grid
 
-CERTAIN = 0.9  # chosen: beside a rival, the posterior with the comparison of this view must be so sure
+CERTAIN = 0.9  # chosen: beside a rival, or if the target is hidden, the posterior must be so sure
 ALIKE = 0.38  # chosen: so well a view must agree; nearly all from the goal's direction do, and no back of a can
 SURE = 0.6  # chosen: the agent says so if looks and fused views together leave at least this probability
 UNLIKELY = 0.25  # chosen: a view that has a lower probability is not the goal's
@@ -47,6 +47,8 @@ class Evidence(NamedTuple):
     @property
     def is_enough(self) -> bool:
         """Whether the agent says that the camera is there."""
+        if self.look == 0.0:  # something hides the target here, so that this view says nothing
+            return self.fused > CERTAIN and not self.rival
         if self.agreement is not None:
             return self.probability > (CERTAIN if self.rival else SURE)
         return self.probability > SURE and (self.look > CLEAR or not self.rival)
