@@ -2,11 +2,13 @@
 
 import numpy as np
 import pytest
+import torch
 
 from saccade.services.belief.looks import AROUND_RAD, Looks
+from saccade.services.perception.colours import unlike
 from saccade.services.perception.core import SceneCCN
 from saccade.services.perception.local_features import LocalFeatures
-from saccade.services.perception.same_view import FEWEST, SameView, following
+from saccade.services.perception.same_view import FEWEST, SameView, following, roll_of
 from saccade.shared.config import WEIGHTS
 from saccade.shared.model.weights import Weights
 from saccade.shared.render.objects import load_mesh
@@ -26,9 +28,9 @@ def pairs(count=60):
 
 def test_pairs_of_one_direction_follow_from_one_map_and_others_do_not():
     there, here = pairs()
-    count, roll_rad = following(there, here)
+    count, affine = following(there, here)
     assert count == len(there)
-    assert roll_rad == pytest.approx(0.06, abs=0.01)
+    assert roll_of(affine) == pytest.approx(0.06, abs=0.01)
     half = np.where(np.arange(len(there))[:, None] % 2, here, here[::-1])
     assert len(there) // 2 <= following(there, half)[0] < 0.7 * len(there)
     assert following(there, 1.0 - there[::-1])[0] < 0.3 * len(there)
@@ -130,3 +132,20 @@ def test_a_view_from_above_is_turned_against_the_goal_image(scene):
 
     same = SameView(LocalFeatures(), model.sides_m, *see(1.0))
     assert same(NAMES.index("rice_box"), *see(1.3)).roll_rad == pytest.approx(0.3 * np.sin(1.3), abs=0.08)
+
+
+def test_a_label_of_another_colour_is_unlike_in_any_light_and_wherever_the_map_puts_it():
+    """The form is the same. Half of the light, or a shift that the map knows, makes nothing unlike."""
+    label = torch.zeros(4, 128, 128)
+    label[3, 30:98, 30:98] = 1.0
+    label[:3, 30:98, 30:98] = torch.tensor([0.8, 0.7, 0.1])[:, None, None]
+    other = label.clone()
+    label[:3, 50:62, 34:94] = torch.tensor([0.2, 0.5, 0.9])[:, None, None]
+    other[:3, 50:62, 34:94] = torch.tensor([0.9, 0.1, 0.1])[:, None, None]
+    dim = torch.cat([label[:3] * 0.5, label[3:]])
+    shifted = np.eye(3, 2) + np.array([[0, 0], [0, 0], [8 / 128, 0]])
+    assert unlike(label, label, np.eye(3, 2)) == pytest.approx(0.0, abs=1e-3)
+    assert unlike(label, dim, np.eye(3, 2)) == pytest.approx(0.0, abs=0.01)
+    assert unlike(label, label.roll(8, dims=2), shifted) == pytest.approx(0.0, abs=0.01)
+    assert unlike(label, other, np.eye(3, 2)) > 0.2
+    assert unlike(label, torch.zeros(4, 128, 128), np.eye(3, 2)) == 0.0  # nothing is seen in both
