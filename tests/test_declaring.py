@@ -51,6 +51,23 @@ def test_where_looks_from_both_sides_are_good_the_better_ones_decide():
     assert Evidence(0.4, 0.8, elsewhere=0.1).is_enough  # elsewhere was never likely
 
 
+def test_a_view_that_was_compared_with_the_goal_image_counts_by_what_all_comparisons_leave():
+    """The looks count no more, and beside a rival more is asked for."""
+    assert Evidence(0.1, 0.7, agreement=0.5).is_enough
+    assert not Evidence(0.99, 0.3, agreement=0.5).is_enough
+    assert not Evidence(0.99, 0.99, agreement=0.3).is_enough
+    assert not Evidence(0.99, 0.7, rival=True, agreement=0.5).is_enough
+    assert Evidence(0.1, 0.95, rival=True, elsewhere=0.9, agreement=0.5).is_enough
+
+
+def test_where_the_target_is_hidden_all_views_must_be_sure():
+    """The goal image shows the target alone, so that from its view another object may be in front of it."""
+    assert Evidence(0.0, 0.95).is_enough
+    assert not Evidence(0.0, 0.8).is_enough
+    assert not Evidence(0.0, 0.95, rival=True).is_enough
+    assert not Evidence(0.01, 0.95).is_enough  # it is seen, and looks otherwise
+
+
 def test_what_all_views_say_of_a_direction():
     said = belief(0, FRONT, posterior(front=0.7, back=0.2), 0.0)
     assert fused_here(said, FRONT, NONE) == pytest.approx(0.7, abs=0.07)

@@ -62,6 +62,15 @@ def test_one_look_does_not_decide_against_the_others():
     assert looks[-1] == "there"
 
 
+@pytest.mark.parametrize(("agreements", "verdict"), [
+    ((0.6, 0.6, 0.1, 0.6, 0.6), "there"), ((0.1, 0.1, 0.6, 0.1, 0.6), "wrong")])
+def test_the_mean_of_comparisons_with_the_goal_image_decides(agreements, verdict):
+    """One blurred image does not decide, nor does one that agrees by chance."""
+    hand = followed()
+    told = [hand.take(at(0), Evidence(0.1, 0.95, agreement=agreement), EYE) for agreement in agreements]
+    assert told[-1] == verdict
+
+
 def test_where_looks_leave_a_doubt_there_are_more_of_them():
     doubt = {"look": 0.4, "fused": 0.6}
     assert verdicts(followed(), [at(0)] * MOST_LOOKS, **doubt) == ["stay"] * (MOST_LOOKS - 1) + ["wrong"]

@@ -77,9 +77,10 @@ def test_the_golden_log_has_the_present_format_and_each_older_one_has_a_log():
 
 
 @pytest.mark.parametrize(("log", "lacks"), [(FORMAT_2, "mask_bits"), (FORMAT_3, "camera_from_object"),
-                                            (FORMAT_4, "rotations")])
+                                            (FORMAT_4, "rotations"), (FORMAT_6, "goal_agreement")])
 def test_what_a_format_did_not_have_is_no_difference(tmp_path, log, lacks):
-    """Format 2 had neither masks nor candidates, format 3 no poses, format 4 no more than one; all else is compared."""
+    """Format 2 had neither masks nor candidates, format 3 no poses, format 4 no more than one, format 6 no
+    comparison with the goal image; all else is compared."""
     assert {getattr(m, lacks) is None for t, _, m in RunReader(log) if t == PERCEPT} == {True}
     done = saccade(log, "--into", "perception,belief,planner", "--check", "--bus", "local", "--out",
                    tmp_path / "replay")

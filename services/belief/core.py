@@ -131,7 +131,7 @@ class BeliefFilter:
             particles_m=position.sample(self.config.belief.published_particles, rng).astype(np.float32),
             views=len(goal_view.keyframes) if goal_view else 0,
             goal_log_posterior=None if posterior is None else posterior.astype(np.float32),
-            goal_range_m=goal_range_m, goal_here=goal_here,
+            goal_range_m=goal_range_m, goal_here=goal_here, goal_agreement=percept.goal_agreement,
             velocity_m=self.motions[name].velocity_m, since_step=self.since[name],
             **_told(goal_view.views if goal_view else None), **energy)
 

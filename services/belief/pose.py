@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from saccade.services.belief.attitude import Views
+from saccade.services.belief.looks import Looks
 from saccade.services.belief.turn import GoalDirections, turn_probability
 from saccade.shared.bus.messages import Percept
 from saccade.shared.config import BeliefConfig
@@ -50,6 +51,7 @@ BETTER = 1.2  # chosen: a view replaces the same kept view if its quality is hig
 CERTAIN = 0.03  # chosen: the quality of a view is its presence / (this + standard deviation of its log scale)
 NEAR_RAD = 0.35  # chosen: views within about this angle of the goal's likeliest direction count more
 NEAR_WEIGHT = 5.0  # chosen: what is added at most to the weight 1 of a view near the goal's likeliest direction
+UNSURE = 0.1  # chosen: probability that the views without comparisons say nothing of the goal's direction
 SAME_SCALE = 0.3  # chosen: weight of the prior that the goal's range is as measured; one near view has at most 1
 FRESH_STEPS = 8  # chosen: views of a drifting object count for so many steps
 MOVED_M = 0.01  # chosen: if the object's position changes by more than this, all displacements are computed again
@@ -170,6 +172,7 @@ class GoalView:
         self.elevation, self.azimuth = (x.ravel() for x in np.meshgrid(elevation, azimuth, indexing="ij"))
         self.keyframes: list[Keyframe] = []
         self.views: Views | None = None  # how the goal's camera was turned, with the last posterior
+        self.looks = Looks(symmetry)
         self.center = np.full(3, np.inf)  # last believed position of the object; none yet
 
     def seen(self, percept: Percept, center: Array) -> None:
@@ -184,6 +187,9 @@ class GoalView:
         if self.config.pose == "last":
             self.keyframes = []
         eye = percept.world_from_camera[:3, 3]
+        if percept.goal_agreement is not None:
+            farther = percept.scale * self.measured_range_m / REFERENCE_RANGE_M
+            self.looks.take(eye, self.center, percept.goal_agreement, farther, percept.goal_roll_rad or 0.0)
         quality = percept.presence / (CERTAIN + percept.log_scale_std)
         near = [k for k in self.keyframes if _angle(k.eye, eye, self.center) < NEW_VIEW_RAD]
         if near and max(k.quality for k in near) * BETTER > quality:
@@ -196,12 +202,13 @@ class GoalView:
 
     def forget(self) -> None:
         """Drops all views: the object was moved, so they say nothing of how it is turned now."""
-        self.keyframes, self.center = [], np.full(3, np.inf)
+        self.keyframes, self.looks, self.center = [], Looks(self.symmetry), np.full(3, np.inf)
 
     def carried(self, move_m: Array, step: int) -> None:
         """Moves the kept views along with an object that drifts by `move_m` [3] (metres), as if they were one piece.
         Views from long before `step` are dropped, because the object may turn while it drifts."""
         self.center = self.center + move_m
+        self.looks.carried(move_m)
         self.keyframes = [k for k in self.keyframes if k.percept.step > step - FRESH_STEPS]
         for keyframe in self.keyframes:
             camera = keyframe.percept.world_from_camera.copy()
@@ -219,14 +226,21 @@ class GoalView:
     def log_posterior(self) -> Array | None:
         """Log probabilities of the directions of the grid, normalised [E, A]. None before the first view.
 
-        The views are fused twice. The second time, views near the peak of the first result count more.
+        The views are fused twice. The second time, views near the peak of the first result count more. What comparisons
+        with the goal image say is multiplied.
         """
         if not self.keyframes:
             return None
         first = self._fused(np.ones(len(self.keyframes)))
-        fused = self._fused(1.0 + NEAR_WEIGHT * self._nearness(self.likeness.grid(first)))
-        self.views = self.likeness.views(fused)
-        return self.likeness.grid(fused)
+        last = self._fused(1.0 + NEAR_WEIGHT * self._nearness(self.likeness.grid(first)))
+        self.views = self.likeness.views(last)
+        fused, compared = self.likeness.grid(last), self.looks.log_ratio(self.center)
+        if compared is None:
+            return fused
+        share = (1 - UNSURE) * np.exp(fused) + UNSURE / fused.size
+        total = np.log(share) + compared
+        total -= total.max()
+        return np.asarray(total - np.log(np.exp(total).sum()))
 
     def _fused(self, weights: Array) -> Array:
         # Views are not independent, and they share the error of the goal's percept: together they count as a few views.
@@ -247,10 +261,13 @@ class GoalView:
         """Range (m) at which the goal image shows the object.
 
         It is the measured range, corrected by the error that the same networks make in views from about the goal's
-        direction. With `belief.pose=last` it is not corrected.
+        direction. With `belief.pose=last` it is not corrected. A view that agrees with the goal image tells it best.
         """
         if self.config.pose == "last":
             return self.measured_range_m
+        compared_m = self.looks.range_m(self.center)
+        if compared_m is not None:
+            return compared_m
         weights = self._nearness(log_posterior)
         ratios = np.log([np.linalg.norm(k.eye - self.center) / k.range_m for k in self.keyframes])
         return float(self.measured_range_m * np.exp(weights @ ratios / (weights.sum() + SAME_SCALE)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -12,10 +12,12 @@ import torch.nn.functional as F
 from numpy.typing import ArrayLike, NDArray
 
 from saccade.services.perception.cropping import Cropper
+from saccade.services.perception.local_features import LocalFeatures
 from saccade.services.perception.networks import INPUT_PX, Extraction, Identity, tally
 from saccade.services.perception.open_world import open_world_of
 from saccade.services.perception.paper import PaperSceneCCN
 from saccade.services.perception.posecnn import PoseCNN
+from saccade.services.perception.same_view import Agreement, SameView
 from saccade.services.perception.seen import Seen, bits
 from saccade.shared.bus.messages import Frame, Goal, Percept
 from saccade.shared.bus.topics import FRAME, GOAL, GOAL_PERCEPT, PERCEPT, Output
@@ -28,6 +30,7 @@ from saccade.shared.world.windows import Window
 
 SERVICE = Service("perception", inputs=(FRAME, GOAL), trigger=FRAME, outputs=(PERCEPT, GOAL_PERCEPT),
                   divisible=True)
+GOAL_UP = (0.0, 1.0, 0.0)  # of a goal image nothing is known but that it stands upright
 
 
 @dataclass(frozen=True)
@@ -136,11 +139,13 @@ class Perception:
         Raises SaccadeError if the weights do not serve them.
         """
         self.names, self.goal_told, self._last = names, False, None
+        self.same_view: SameView | None = None  # which compares images with the goal image
         self.model = self._make(names) if names else None
+        self.features = LocalFeatures() if isinstance(self.model, SceneCCN) else None  # others compare by themselves
 
     def begin(self, run: str, episode: int) -> Iterable[Output]:
         """Starts an episode. Percepts depend on one image alone, so there is nothing else to reset."""
-        self.goal_told = False
+        self.goal_told, self.same_view = False, None
         return ()
 
     def step(self, inputs: Inputs) -> Iterable[Output]:
@@ -154,7 +159,15 @@ class Perception:
             yield from self._goal(model, inputs["goal"])
         seen = self._seen(model, frame)
         for k, name in enumerate(self.names):
-            yield Output(PERCEPT, percept(frame, name, seen, k, frame.world_from_camera), name)
+            told, agrees = percept(frame, name, seen, k, frame.world_from_camera), self._agreement(k, frame, seen)
+            if agrees is not None:
+                told = replace(told, goal_agreement=agrees.share, goal_roll_rad=agrees.roll_rad)
+            yield Output(PERCEPT, told, name)
+
+    def _agreement(self, k: int, frame: Frame, seen: Seen) -> Agreement | None:
+        if self.same_view is None:
+            return None
+        return self.same_view(k, frame.rgb, frame.intrinsics_px, frame.world_from_camera[2, :3], seen)
 
     def _seen(self, model: Model, frame: Frame) -> Seen:
         if self._last is None or not _same_view(self._last[0], frame):
@@ -166,10 +179,12 @@ class Perception:
         """The percepts of the goal image. Without a goal image the presence of every object is 0."""
         if goal.rgb is None:
             blank = np.zeros((480, 480, 3), dtype=np.uint8)
-            seen = model.see(blank, goal.intrinsics_px, (0.0, 1.0, 0.0))
+            seen = model.see(blank, goal.intrinsics_px, GOAL_UP)
             seen.presence[:] = 0.0
         else:
-            seen = model.see(goal.rgb, goal.intrinsics_px, (0.0, 1.0, 0.0), alone=True)
+            seen = model.see(goal.rgb, goal.intrinsics_px, GOAL_UP, alone=True)
+            if isinstance(model, SceneCCN) and self.features is not None:
+                self.same_view = SameView(self.features, model.sides_m, goal.rgb, goal.intrinsics_px, GOAL_UP, seen)
         for k, name in enumerate(self.names):
             yield Output(GOAL_PERCEPT, percept(goal, name, seen, k, np.eye(4)), name)
 

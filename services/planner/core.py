@@ -40,6 +40,7 @@ FOUND_M = 0.06  # chosen: the target counts as found if the deviation of its pos
 KNOWN_M = 0.10  # chosen: an object becomes an obstacle if the deviation of its position is below this
 ARRIVED_M = 0.01  # chosen: the camera has arrived if it is within this distance of its viewpoint and within ARRIVED_RAD
 ARRIVED_RAD = 0.05  # chosen: the camera has arrived if it is within this angle of its viewpoint and within ARRIVED_M
+THERE_M = 0.04  # chosen: a view that was compared is the goal's if the goal's is believed to be within this of it
 STUCK_M = 0.002  # chosen: a camera that moves less than this in a step counts as arrived, because it cannot come nearer
 TURN_M = 0.10  # chosen: nearer than this to its viewpoint the camera turns as planned; before, it looks at the target
 VISITED_M = 0.05  # chosen: viewpoints within about this distance of one that was not the goal's also become costly
@@ -73,6 +74,7 @@ class Planner:
         self.wanted: Array | None = None  # the rival direction [3] from which the agent is about to look
         self.since = 0  # the step since which the target is as it is
         self.velocity_m: Array | None = None  # of the target, as believed [3]
+        self.is_near = False  # the goal's view is sure to be near, and the agent goes to where it is believed to be
         self.visited: list[Array] = []  # camera poses [4, 4] at which the agent has arrived in the mode "goal"
         return ()
 
@@ -97,7 +99,7 @@ class Planner:
         self._note_rivals(beliefs)
         chosen, mode, eye = self.plan, self._mode(beliefs), self._believed_eye(beliefs, camera, ground)
         moved = self._moved if self.hand is None else self._followed
-        due, declared = moved(chosen, mode, beliefs, camera, eye)
+        due, declared = moved(chosen, mode, beliefs, camera, None if eye is None else ground.nearest(eye))
         if chosen is not None:
             chosen = self.plan = carried(chosen, self.velocity_m)
         if chosen is None or due:
@@ -124,7 +126,7 @@ class Planner:
             return beliefs
         if beliefs[target].since_step > self.since:
             self.since, self.plan = beliefs[target].since_step, None
-            self.rivals, self.wanted, self.visited = Rivals(), None, []
+            self.rivals, self.wanted, self.visited, self.is_near = Rivals(), None, [], False
         self.velocity_m = velocity_m = beliefs[target].velocity_m
         if velocity_m is not None:
             self.visited = [shifted(seen, velocity_m) for seen in self.visited]
@@ -151,9 +153,11 @@ class Planner:
                 declared = target.goal_here > SURE_ALONE
             else:
                 evidence = self._evidence(target, camera)
-                declared = evidence.is_enough
-                self._has_looked(target, camera, evidence.look,
-                                 wrong=not evidence.rival or evidence.probability < UNLIKELY)
+                self.is_near = evidence.is_enough
+                declared = evidence.is_enough and self._is_at(eye, camera, evidence)
+                if not self.is_near:
+                    self._has_looked(target, camera, evidence.look,
+                                     wrong=not evidence.rival or evidence.probability < UNLIKELY)
         self.age += 1
         due = chosen is None or arrived or mode != chosen.mode or self.age >= self._patience
         return due, declared
@@ -188,7 +192,11 @@ class Planner:
         fused = fused_here(target, camera, self.symmetry[target.object])
         return Evidence(target.goal_here, fused,
                         self.rivals.beside(camera, target.mean_m) is not None,
-                        self.rivals.elsewhere(camera, target.mean_m))
+                        self.rivals.elsewhere(camera, target.mean_m), target.goal_agreement)
+
+    def _is_at(self, eye: Array | None, camera: Array, evidence: Evidence) -> bool:
+        """Whether the camera is where the goal's view is believed to be, `eye` [3], now that it was compared."""
+        return eye is None or evidence.agreement is None or bool(np.linalg.norm(eye - camera[:3, 3]) < THERE_M)
 
     def _has_looked(self, target: Belief, camera: Array, look: float, *, wrong: bool) -> None:
         """The agent has arrived and looked, and goes on: to a rival, if the view may be the goal's all the same."""
@@ -261,7 +269,8 @@ class Planner:
         else:  # of equally informative viewpoints the nearest is taken
             cost = terms.total + way_cost(eyes, camera)
         cost = cost + ground.hidden_cost(eyes, gazes)
-        chosen = ground.best(cost, eyes, camera) if self.wanted is None or best is None else len(eyes) - 1
+        leads = best is not None and (self.wanted is not None or self.is_near)
+        chosen = len(eyes) - 1 if leads else ground.best(cost, eyes, camera)
         if found is None or best is None:
             viewpoint = look_at(ground.nearest(eyes[chosen]), gazes[chosen])
         elif chosen == len(eyes) - 1:

@@ -15,6 +15,8 @@ from saccade.shared.bus.messages import Belief
 from saccade.shared.world.directions import alike
 from saccade.shared.world.geometry import Array, direction, unit, viewing_grid
 
+CERTAIN = 0.9  # chosen: beside a rival, or if the target is hidden, the posterior must be so sure
+ALIKE = 0.38  # chosen: so well a view must agree; nearly all from the goal's direction do, and no back of a can
 SURE = 0.6  # chosen: the agent says so if looks and fused views together leave at least this probability
 UNLIKELY = 0.25  # chosen: a view that has a lower probability is not the goal's
 CLEAR = 0.93  # chosen: looks that are clearer than this need no look at rivals; a view that may be wrong reaches 0.95
@@ -25,21 +27,30 @@ AROUND_RAD, APART_RAD = 0.4, 0.8  # chosen: what counts as around a direction, a
 
 class Evidence(NamedTuple):
     """What speaks for the goal's view being here: the probability by the looks from here, that by all views, whether a
-    rival direction is left from which the agent has not looked, and the probability by the best looks elsewhere."""
+    rival direction is left from which the agent has not looked, the probability by the best looks elsewhere, and
+    how well the view agrees with the goal image, if it was compared: then the probability by all views holds all of
+    this."""
 
     look: float
     fused: float
     rival: bool = False
     elsewhere: float = 0.0
+    agreement: float | None = None
 
     @property
     def probability(self) -> float:
         """The probability that the goal's view is here."""
+        if self.agreement is not None:
+            return self.fused if self.agreement > ALIKE else 0.0
         return together(self.look, self.fused if self.elsewhere < UNLIKELY else 1.0 - self.elsewhere)
 
     @property
     def is_enough(self) -> bool:
         """Whether the agent says that the camera is there."""
+        if self.look == 0.0:  # something hides the target here, so that this view says nothing
+            return self.fused > CERTAIN and not self.rival
+        if self.agreement is not None:
+            return self.probability > (CERTAIN if self.rival else SURE)
         return self.probability > SURE and (self.look > CLEAR or not self.rival)
 
 

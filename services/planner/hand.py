@@ -37,6 +37,7 @@ class Hand:
         self._viewpoint, self._eye = pose(viewpoint[:3, :3], clip(viewpoint[:3, 3], spheres)), eye
         self._nearest_m, self._age = np.inf, 0
         self._looks: list[float] = []
+        self._agreements: list[float] = []
         return self._viewpoint
 
     def take(self, camera: Array, evidence: Evidence | None, eye: Array | None) -> Verdict:
@@ -56,10 +57,13 @@ class Hand:
         self._nearest_m = min(self._nearest_m, away_m)
         if not success(camera, self._viewpoint):
             self._looks.clear()
+            self._agreements.clear()
             return "renew" if away_m > self._nearest_m + ELSEWHERE_M else "stay"
         if evidence is None:
             return "renew"
         self._looks.append(evidence.look)
+        if evidence.agreement is not None:
+            self._agreements.append(evidence.agreement)
         near = away_m < NEAR_M and rotation_angle(camera[:3, :3], self._viewpoint[:3, :3]) < NEAR_RAD
         if len(self._looks) < (LOOKS if near else PATIENCE):
             return "stay"
@@ -69,7 +73,7 @@ class Hand:
 
     def _judge(self, evidence: Evidence) -> Verdict:
         """Whether the view is the goal's, by the looks at it so far; `stay` asks for more of them."""
-        evidence = evidence._replace(look=self.look)
+        evidence = evidence._replace(look=self.look, agreement=_recent(self._agreements))
         self.there = evidence.is_enough
         if self.there:
             return "there"
@@ -80,9 +84,14 @@ class Hand:
     @property
     def look(self) -> float:
         """The mean of the looks at the viewpoint so far. 0 before the first."""
-        return float(np.mean(self._looks[-MOST_LOOKS:])) if self._looks else 0.0
+        return _recent(self._looks) or 0.0
 
     def _has_moved(self, eye: Array | None, by_m: float) -> bool:
         if eye is None or self._eye is None:
             return False
         return bool(np.linalg.norm(eye - self._eye) > by_m)
+
+
+def _recent(values: list[float]) -> float | None:
+    """The mean of the last values. None if there are none."""
+    return float(np.mean(values[-MOST_LOOKS:])) if values else None

@@ -98,7 +98,7 @@ class Percept(Message):
     """What the networks of one object made of one image (paper, section 3.2), on `percept` and `goal_percept`. On
     `goal_percept` the camera's pose is unknown: the identity stands for it."""
 
-    VERSION: ClassVar[int] = 4
+    VERSION: ClassVar[int] = 5
 
     object: str
     """Name of the object."""
@@ -133,6 +133,11 @@ class Percept(Message):
     """Their log probabilities."""
     deviation_rad: Annotated[np.ndarray, array("f8", "R")] | None = None
     """Their standard deviations, radians."""
+    goal_agreement: float | None = None
+    """Share of the object's local features that agree with those in the goal image, where both are compared: where the
+    object is about as large and about at the same place in the image."""
+    goal_roll_rad: float | None = None
+    """By what angle these features are turned to the right, against those in the goal image."""
 
     def mask(self) -> np.ndarray | None:
         """Where in the image the object is seen: truth values [M, M]. None if the message has no mask."""
@@ -178,6 +183,9 @@ class Belief(Message):
     since_step: int = 0
     """Step since which it is believed to be as it is: at which it was last noticed to be moved, turned or back. 0 if
     nothing has happened to it."""
+    goal_agreement: float | None = None
+    """Share of the local features of the present view that agree with those of the goal image, where both are compared.
+    The posterior takes it into account."""
     f_pose: float = 0.0
     """Term of the variational free energy (paper, appendix A), nats: the latent pose."""
     f_identity: float = 0.0

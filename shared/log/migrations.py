@@ -80,11 +80,13 @@ def with_places_and_instances() -> Change:
     return change
 
 
-def with_motion_and_rolls() -> Change:
-    """Format 6 to 7: a belief may tell how the goal's camera was rolled, and how an object moves. The topic `events` is
-    new."""
-    added: dict[type[m.Message], Fields] = {m.Belief: {
-        "version": 2, "goal_rotations": None, "goal_rotations_log_probability": None, "velocity_m": None, "since_step": 0}}
+def with_motion_and_comparisons() -> Change:
+    """Format 6 to 7: a belief may tell how the goal's camera was rolled, how an object moves, and, as a percept may, how
+    well the present view agrees with the goal image. The topic `events` is new."""
+    added: dict[type[m.Message], Fields] = {
+        m.Percept: {"version": 5, "goal_agreement": None, "goal_roll_rad": None},
+        m.Belief: {"version": 2, "goal_rotations": None, "goal_rotations_log_probability": None, "velocity_m": None,
+                   "since_step": 0, "goal_agreement": None}}
 
     def change(topic: Topic, part: str | None, fields: Fields) -> Fields:
         return fields | added.get(topic.type, {})
@@ -93,7 +95,8 @@ def with_motion_and_rolls() -> Change:
 
 
 CHANGES: tuple[Callable[[], Change], ...] = (count_in_episodes, with_masks_and_candidates, with_poses,
-                                             with_several_rotations, with_places_and_instances, with_motion_and_rolls)
+                                             with_several_rotations, with_places_and_instances,
+                                             with_motion_and_comparisons)
 FORMAT = OLDEST + len(CHANGES)
 
 

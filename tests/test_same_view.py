@@ -1,0 +1,151 @@
+"""Whether an image shows the goal's object as the goal image does, and what the belief makes of it."""
+
+import numpy as np
+import pytest
+import torch
+
+from saccade.services.belief.looks import AROUND_RAD, Looks
+from saccade.services.perception.colours import unlike
+from saccade.services.perception.core import SceneCCN
+from saccade.services.perception.local_features import LocalFeatures
+from saccade.services.perception.same_view import FEWEST, SameView, following, roll_of
+from saccade.shared.config import WEIGHTS
+from saccade.shared.model.weights import Weights
+from saccade.shared.render.objects import load_mesh
+from saccade.shared.render.world import World
+from saccade.shared.world.geometry import INTRINSICS_PX, direction, look_at, viewing_grid, wrap
+from saccade.shared.world.symmetry import NONE
+
+NAMES, CENTER = ("soup_can", "rice_box"), np.array([0.05, -0.05, 0.06])
+GOAL_UP = (0.0, 1.0, 0.0)
+
+
+def pairs(count=60):
+    """Places in two crops, the second a little larger, turned and shifted, as in two views from about one direction."""
+    there = np.random.default_rng(0).uniform(0.2, 0.8, (count, 2))
+    return there, (there - 0.5) @ np.array([[1.05, 0.06], [-0.06, 1.0]]) + (0.53, 0.48)
+
+
+def test_pairs_of_one_direction_follow_from_one_map_and_others_do_not():
+    there, here = pairs()
+    count, affine = following(there, here)
+    assert count == len(there)
+    assert roll_of(affine) == pytest.approx(0.06, abs=0.01)
+    half = np.where(np.arange(len(there))[:, None] % 2, here, here[::-1])
+    assert len(there) // 2 <= following(there, half)[0] < 0.7 * len(there)
+    assert following(there, 1.0 - there[::-1])[0] < 0.3 * len(there)
+    assert following(there[:FEWEST - 1], here[:FEWEST - 1])[0] == 0
+
+
+@pytest.fixture(scope="module")
+def scene():
+    world = World(tuple(load_mesh("pantry", name) for name in NAMES))
+    model = SceneCCN(Weights(WEIGHTS / "pantry"), NAMES)
+    yield world, model
+    world.close()
+
+
+def views(scene):
+    """Looks at the rice box from a direction and a range, and says how well the view agrees with the goal image."""
+    world, model = scene
+    world.place({"rice_box": (CENTER, 0.0)}, (120, 90, 60))
+
+    def see(azimuth, elevation, range_m, aside_m=0.0, up=None):
+        camera = look_at(CENTER + range_m * direction(azimuth, elevation), CENTER + np.array([0, 0, aside_m]))
+        rgb, up = world.render(camera), camera[2, :3] if up is None else up
+        return rgb, INTRINSICS_PX, up, model.see(rgb, INTRINSICS_PX, up)
+
+    same = SameView(LocalFeatures(), model.sides_m, *see(0.4, 0.6, 0.4, up=GOAL_UP))
+    return lambda *at: same(NAMES.index("rice_box"), *see(*at)), same, see
+
+
+def test_a_view_from_the_goals_direction_agrees_more_than_those_from_elsewhere(scene):
+    agreement, *_ = views(scene)
+    here = agreement(0.45, 0.63, 0.42).share
+    assert here > 0.5
+    assert all(agreement(0.4 + turned, 0.6, 0.4).share < here - 0.2 for turned in (0.8, 2.0, np.pi))
+
+
+def test_what_cannot_be_the_goals_view_is_not_compared(scene):
+    """An object that is larger, elsewhere in the image, or not in the goal image."""
+    agreement, same, see = views(scene)
+    assert agreement(0.4, 0.6, 0.65) is None
+    assert agreement(0.4, 0.6, 0.4, 0.15) is None
+    assert same(NAMES.index("soup_can"), *see(0.4, 0.6, 0.4)) is None
+
+
+def at(azimuth, elevation=0.6):
+    return CENTER + 0.4 * direction(azimuth, elevation)
+
+
+def ratio_at(looks, azimuth, elevation=0.6) -> float:
+    rows, columns = viewing_grid()
+    row, column = np.abs(rows - elevation).argmin(), np.abs(wrap(columns - azimuth)).argmin()
+    return float(looks.log_ratio(CENTER)[row, column])
+
+
+def test_a_comparison_counts_for_its_own_direction_and_says_nothing_of_others():
+    looks = Looks(NONE)
+    assert looks.log_ratio(CENTER) is None
+    looks.take(at(1.0), CENTER, 0.8, 1.0)
+    looks.take(at(-2.0), CENTER, 0.1, 1.0)
+    assert ratio_at(looks, 1.0) > 4
+    assert ratio_at(looks, -2.0) < -2
+    assert abs(ratio_at(looks, 1.0 + 5 * AROUND_RAD)) < 0.1
+    looks.take(at(1.01), CENTER, 0.2, 1.0)  # the last from one direction counts
+    assert ratio_at(looks, 1.0) < 0
+
+
+def test_what_a_comparison_says_of_a_symmetric_object_holds_wherever_it_looks_the_same():
+    looks = Looks(2)
+    looks.take(at(1.0), CENTER, 0.8, 1.0)
+    assert ratio_at(looks, 1.0 + np.pi) == pytest.approx(ratio_at(looks, 1.0), abs=0.2)
+    assert abs(ratio_at(looks, 1.0 + np.pi / 2)) < 0.1
+
+
+def test_the_view_that_agrees_best_tells_the_goals_range():
+    """If it agrees at all: a view from elsewhere says nothing of the range."""
+    looks = Looks(NONE)
+    looks.take(at(-2.0), CENTER, 0.1, 2.0)
+    assert looks.range_m(CENTER) is None
+    looks.take(at(1.0), CENTER, 0.8, 1.25)
+    assert looks.range_m(CENTER) == pytest.approx(0.5)
+
+
+def test_from_above_the_turn_of_the_image_tells_the_goals_azimuth():
+    """The sign is that of the renderer: from a larger azimuth things are turned to the right."""
+    looks, low = Looks(NONE), Looks(NONE)
+    looks.take(at(1.0, 1.3), CENTER, 0.6, 1.0, roll_rad=0.4)
+    low.take(at(1.0, 0.3), CENTER, 0.6, 1.0, roll_rad=0.4)
+    assert ratio_at(looks, 1.0 - 0.4, 1.3) > 3 * ratio_at(looks, 1.0, 1.3)
+    assert ratio_at(low, 1.0, 0.3) > 3
+
+
+def test_a_view_from_above_is_turned_against_the_goal_image(scene):
+    world, model = scene
+    world.place({"rice_box": (CENTER, 0.0)}, (120, 90, 60))
+
+    def see(azimuth):
+        camera = look_at(CENTER + 0.4 * direction(azimuth, 1.3), CENTER)
+        rgb = world.render(camera)
+        return rgb, INTRINSICS_PX, camera[2, :3], model.see(rgb, INTRINSICS_PX, camera[2, :3])
+
+    same = SameView(LocalFeatures(), model.sides_m, *see(1.0))
+    assert same(NAMES.index("rice_box"), *see(1.3)).roll_rad == pytest.approx(0.3 * np.sin(1.3), abs=0.08)
+
+
+def test_a_label_of_another_colour_is_unlike_in_any_light_and_wherever_the_map_puts_it():
+    """The form is the same. Half of the light, or a shift that the map knows, makes nothing unlike."""
+    label = torch.zeros(4, 128, 128)
+    label[3, 30:98, 30:98] = 1.0
+    label[:3, 30:98, 30:98] = torch.tensor([0.8, 0.7, 0.1])[:, None, None]
+    other = label.clone()
+    label[:3, 50:62, 34:94] = torch.tensor([0.2, 0.5, 0.9])[:, None, None]
+    other[:3, 50:62, 34:94] = torch.tensor([0.9, 0.1, 0.1])[:, None, None]
+    dim = torch.cat([label[:3] * 0.5, label[3:]])
+    shifted = np.eye(3, 2) + np.array([[0, 0], [0, 0], [8 / 128, 0]])
+    assert unlike(label, label, np.eye(3, 2)) == pytest.approx(0.0, abs=1e-3)
+    assert unlike(label, dim, np.eye(3, 2)) == pytest.approx(0.0, abs=0.01)
+    assert unlike(label, label.roll(8, dims=2), shifted) == pytest.approx(0.0, abs=0.01)
+    assert unlike(label, other, np.eye(3, 2)) > 0.2
+    assert unlike(label, torch.zeros(4, 128, 128), np.eye(3, 2)) == 0.0  # nothing is seen in both
