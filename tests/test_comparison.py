@@ -2,11 +2,13 @@
 
 import io
 import json
+import shutil
 from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
 
+from saccade.app import provenance
 from saccade.app.bench import comparison
 from saccade.app.bench.comparison import cells, compare
 from saccade.app.bench.table import PAPER_AGENTS, PAPER_ROOM
@@ -44,6 +46,14 @@ def test_what_is_there_is_not_run_again_and_more_scenes_are(written, monkeypatch
     assert run == ["still"]
     results = json.loads((written / "results" / "still_pantry_lexa-room.json").read_text())
     assert len(results["results"]) == 3
+
+
+def test_results_count_wherever_their_folder_lies(written, tmp_path, monkeypatch):
+    """Within the repository, too, where they name their files by the path."""
+    monkeypatch.setattr(provenance, "PACKAGE", tmp_path)
+    shutil.copytree(written / "results", tmp_path / "elsewhere" / "results")
+    monkeypatch.setattr(comparison, "bench", lambda *_, **__: pytest.fail("it is there"))
+    compare(tmp_path / "elsewhere", "pantry", agents=AGENTS, limit=2, console=Console(file=io.StringIO()))
 
 
 def test_every_agent_of_the_paper_has_its_rows(tmp_path):

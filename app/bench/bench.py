@@ -133,10 +133,20 @@ def facts(plan: Plan, command: str) -> dict[str, Any]:
 
 def differing(held: Mapping[str, Any], origin: Mapping[str, Any]) -> list[str]:
     """Which of the facts that matter differ. A setting that came after the held results were made counts there as its
-    default."""
+    default. Of a file of scenes its content matters, not where it lies."""
     if isinstance(config := held.get("config"), dict):
         held = {**held, "config": merged(Config().model_dump(mode="json"), config)}
+    held, origin = _wherever(held), _wherever(origin)
     return [key for key in MATTERS if held.get(key) != origin[key]]
+
+
+def _wherever(facts: Mapping[str, Any]) -> dict[str, Any]:
+    """Facts without the place of the file of scenes."""
+    scenes, config = facts.get("scenes"), facts.get("config")
+    if not (isinstance(scenes, dict) and isinstance(config, dict) and isinstance(config.get("scene"), dict)):
+        return dict(facts)
+    scene = {**config["scene"], "file": None}
+    return {**facts, "scenes": {**scenes, "file": None}, "config": {**config, "scene": scene}}
 
 
 def bench(plan: Plan, *, jobs: int, command: str, console: Console, cluster: str | None = None) -> list[dict[str, Any]]:
