@@ -9,7 +9,7 @@ import numpy as np
 
 from saccade.shared.bus.messages import Message, field_types
 
-DIMENSIONS = {"H": 4, "W": 5, "L": 8, "N": 3, "E": 6, "A": 7, "M": 10, "B": 2, "R": 4}
+DIMENSIONS = {"H": 4, "W": 5, "L": 8, "N": 3, "E": 6, "A": 7, "M": 10, "B": 2, "R": 4, "G": 2}
 VALUES = {str: "mug", int: 3, float: 0.5, bool: True, list[str]: ["mug", "can"]}
 
 

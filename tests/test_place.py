@@ -27,7 +27,7 @@ from saccade.shared.world.geometry import (
     viewing_grid,
     yaw_rotation,
 )
-from saccade.shared.world.place import place_of
+from saccade.shared.world.place import HIGH_M, place_of
 from saccade.shared.world.task import Spheres, apply_action
 from saccade.shared.world.ways import Ways
 from saccade.shared.world.workspace import CLEARANCE_M, NO_BOXES, Boxes
@@ -111,7 +111,7 @@ def test_without_a_workspace_there_is_no_place():
 
 def test_objects_are_looked_for_on_the_table_that_is_told():
     extent = place_of(told()).extent_m(np.zeros((3, 2)))
-    np.testing.assert_allclose(extent, [[-0.6, 0.6], [-0.4, 0.4], [TOP_M, TOP_M + 0.5]])
+    np.testing.assert_allclose(extent, [[-0.6, 0.6], [-0.4, 0.4], [TOP_M, TOP_M + HIGH_M]])
     paper = np.array([[-0.5, 0.5], [-0.5, 0.5], [0.0, 0.5]])
     assert place_of(told(table_m=None)).extent_m(paper) is paper
 

@@ -20,7 +20,7 @@ from saccade.shared.world.workspace import (
     boxes_of,
 )
 
-HIGH_M = 0.5  # above the table up to which objects are looked for, as in the paper
+HIGH_M = 0.3  # chosen: objects stand or lie on the table or in a heap: their middles are lower above it than this
 SUNK_M = 0.01  # by which the table is lower where it hides something, so that what stands on it is not in it
 
 
