@@ -18,7 +18,7 @@ from saccade.app.replay.replay import REPLAYABLE
 from saccade.app.replay.tolerances import TOLERANCES, tolerance_of
 from saccade.app.run.run import run
 from saccade.shared.bus.messages import field_types
-from saccade.shared.bus.topics import ACTION, BELIEF, FRAME, GOAL, GOAL_PERCEPT, PERCEPT, STATUS, TOPICS, TRUTH
+from saccade.shared.bus.topics import ACTION, BELIEF, EVENTS, FRAME, GOAL, GOAL_PERCEPT, PERCEPT, STATUS, TOPICS, TRUTH
 from saccade.shared.bus.wire import encode
 from saccade.shared.log.migrations import FORMAT, OLDEST
 from saccade.shared.log.reading import RunReader
@@ -95,7 +95,13 @@ def test_a_log_without_places_and_instances_tells_a_scene_of_the_paper():
     assert goal.workspace_m is None
     assert {(t.target_instance, t.instances, t.events) for t in truths} == {(1, None, None)}
     assert truths[0].labels() == truths[0].names
-    assert not changes(FORMAT_5, GOLDEN)
+    assert not changes(FORMAT_5, FORMAT_6)
+
+
+def test_a_log_without_motion_tells_objects_that_rest():
+    """Format 6: beliefs lacked it, and there was no topic for events."""
+    assert all(t != EVENTS for t, _, _ in RunReader(FORMAT_6))
+    assert {m.velocity_m is None and m.since_step == 0 for t, _, m in RunReader(FORMAT_6) if t == BELIEF} == {True}
 
 
 def test_a_belief_without_rolled_goals_is_one_of_an_upright_world():

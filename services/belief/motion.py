@@ -22,7 +22,7 @@ Kind = Literal["moved", "turned", "gone", "back", "drifts", "rests"]
 
 RATE = 0.01  # chosen: probability that something happens to an object, in a step
 LEAST_OUTLIER = 0.02  # chosen: least probability that a percept is of something else
-OVERLOOKED = 0.1  # chosen: probability that an object in clear view is not seen
+OVERLOOKED = 0.05  # chosen: probability that an object in clear view is not seen
 LOG_RATE = float(np.log(RATE))
 LOG_ELSEWHERE = -float(np.log(np.diff(WORKSPACE_M).prod()))  # density of a percept of something else, anywhere
 KEPT = 8  # chosen: accounts that are kept
