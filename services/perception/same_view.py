@@ -60,7 +60,8 @@ class SameView:
                  up: ArrayLike, seen: Seen):
         self._features, self._sides_m = features, np.asarray(sides_m, dtype=np.float64)
         self._intrinsics_px, self._seen = np.asarray(intrinsics_px), seen
-        self._shown = {k: self._of(k, rgb, intrinsics_px, up, seen) for k, presence in enumerate(seen.presence) if presence > SHOWN}
+        known = map(int, np.flatnonzero(seen.presence > SHOWN))
+        self._shown = {k: self._of(k, rgb, intrinsics_px, up, seen) for k in known}
 
     def __call__(self, k: int, rgb: NDArray[np.uint8], intrinsics_px: ArrayLike, up: ArrayLike,
                  seen: Seen) -> Agreement | None:
