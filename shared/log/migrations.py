@@ -81,7 +81,7 @@ def with_places_and_instances() -> Change:
 def with_agreement() -> Change:
     """Format 6 to 7: percepts and beliefs may tell how well the present view agrees with the goal image."""
     added: dict[type[m.Message], Fields] = {
-        m.Percept: {"version": 5, "goal_agreement": None, "goal_roll_rad": None},
+        m.Percept: {"version": 5, "goal_agreement": None, "goal_aside_rad": None},
         m.Belief: {"version": 2, "goal_agreement": None}}
 
     def change(topic: Topic, part: str | None, fields: Fields) -> Fields:
