@@ -23,7 +23,7 @@ PER_AGREEMENT, WITHOUT = 18.0, -6.5
 AROUND_RAD = 0.15  # chosen: a comparison counts for directions within about this angle
 IN_PART = 0.2  # chosen: a view that agrees so well may be from beside the goal's direction
 BESIDE_RAD = (0.06, 0.6)  # chosen: how far beside
-WORTH_A_LOOK = 2.0  # chosen: what such a view makes of the log ratio there, at most
+WORTH_A_LOOK = 4.0  # chosen: what such a view makes of the log ratio there, at most
 FIRST_RAD = 0.15  # chosen: a comparison from so much farther away decides before one that only points there
 SAME_RAD = 0.08  # chosen: of comparisons from within this angle the last counts
 
