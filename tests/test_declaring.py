@@ -60,6 +60,13 @@ def test_a_view_that_was_compared_with_the_goal_image_counts_by_what_all_compari
     assert Evidence(0.1, 0.95, rival=True, elsewhere=0.9, agreement=0.5).is_enough
 
 
+def test_a_view_that_agrees_in_part_is_not_given_up():
+    """The goal's may be beside it. Another side agrees less."""
+    assert Evidence(0.5, 0.3, agreement=0.35).is_beside
+    assert not Evidence(0.5, 0.3, agreement=0.25).is_beside
+    assert not Evidence(0.5, 0.3).is_beside
+
+
 def test_where_the_target_is_hidden_all_views_must_be_sure():
     """The goal image shows the target alone, so that from its view another object may be in front of it."""
     assert Evidence(0.0, 0.95).is_enough

@@ -112,26 +112,34 @@ def test_the_view_that_agrees_best_tells_the_goals_range():
     assert looks.range_m(CENTER) == pytest.approx(0.5)
 
 
-def test_from_above_the_turn_of_the_image_tells_the_goals_azimuth():
-    """The sign is that of the renderer: from a larger azimuth things are turned to the right."""
-    looks, low = Looks(NONE), Looks(NONE)
-    looks.take(at(1.0, 1.3), CENTER, 0.6, 1.0, roll_rad=0.4)
-    low.take(at(1.0, 0.3), CENTER, 0.6, 1.0, roll_rad=0.4)
-    assert ratio_at(looks, 1.0 - 0.4, 1.3) > 3 * ratio_at(looks, 1.0, 1.3)
-    assert ratio_at(low, 1.0, 0.3) > 3
+def test_a_view_from_beside_points_to_the_goals_direction():
+    """Also one that agrees in part, but not one that hardly agrees."""
+    looks, part, hardly = Looks(NONE), Looks(NONE), Looks(NONE)
+    looks.take(at(1.0), CENTER, 0.6, 1.0, aside_rad=-0.4)
+    part.take(at(1.0), CENTER, 0.3, 1.0, aside_rad=-0.4)
+    hardly.take(at(1.0), CENTER, 0.1, 1.0, aside_rad=-0.4)
+    assert ratio_at(looks, 0.6) > 3 * ratio_at(looks, 1.0)
+    assert ratio_at(part, 0.6) > 1 > ratio_at(part, 1.0)
+    assert abs(ratio_at(hardly, 0.6)) < 0.5
+    part.take(at(0.6), CENTER, 0.1, 1.0)  # what is seen there decides
+    assert ratio_at(part, 0.6) < -3
 
 
-def test_a_view_from_above_is_turned_against_the_goal_image(scene):
+@pytest.mark.parametrize("elevation", [1.3, 0.5])
+def test_the_images_tell_which_way_around_the_object_the_goals_view_is(scene, elevation):
+    """From above things are turned in the image, from the side their surface is shifted."""
     world, model = scene
     world.place({"rice_box": (CENTER, 0.0)}, (120, 90, 60))
 
     def see(azimuth):
-        camera = look_at(CENTER + 0.4 * direction(azimuth, 1.3), CENTER)
+        camera = look_at(CENTER + 0.4 * direction(azimuth, elevation), CENTER)
         rgb = world.render(camera)
         return rgb, INTRINSICS_PX, camera[2, :3], model.see(rgb, INTRINSICS_PX, camera[2, :3])
 
-    same = SameView(LocalFeatures(), model.sides_m, *see(1.0))
-    assert same(NAMES.index("rice_box"), *see(1.3)).roll_rad == pytest.approx(0.3 * np.sin(1.3), abs=0.08)
+    same = SameView(LocalFeatures(), model.sides_m, *see(0.4))
+    for turned in (0.2, -0.2):
+        aside_rad = same(NAMES.index("rice_box"), *see(0.4 + turned)).aside_rad
+        assert 0.2 < -aside_rad / turned < 1.8
 
 
 def test_a_label_of_another_colour_is_unlike_in_any_light_and_wherever_the_map_puts_it():

@@ -21,18 +21,23 @@ Array = NDArray[np.float64]
 # than from elsewhere.
 PER_AGREEMENT, WITHOUT = 18.0, -6.5
 AROUND_RAD = 0.15  # chosen: a comparison counts for directions within about this angle
-FROM_ABOVE_RAD = 0.8  # chosen: from a higher elevation the turn of the image tells the goal's azimuth
+IN_PART = 0.2  # chosen: a view that agrees so well may be from beside the goal's direction
+BESIDE_RAD = (0.06, 0.6)  # chosen: how far beside
+WORTH_A_LOOK = 4.0  # chosen: what such a view makes of the log ratio there, at most
+FIRST_RAD = 0.15  # chosen: a comparison from so much farther away decides before one that only points there
 SAME_RAD = 0.08  # chosen: of comparisons from within this angle the last counts
 
 
 class Look(NamedTuple):
     """One comparison: where the camera was [3] (m, world), the log of the ratio of likelihoods, how many times farther
-    than in this view the goal image shows the object, and by how much the goal's azimuth is another."""
+    than in this view the goal image shows the object, by how much the goal's azimuth is another, and how well
+    the view agrees."""
 
     eye: Array
     log_ratio: float
     farther: float
     aside_rad: float
+    agreement: float
 
 
 class Looks:
@@ -42,19 +47,21 @@ class Looks:
         self._equal_rad = turns_of(symmetry, GRID_AZIMUTHS)
         self._looks: list[Look] = []
 
-    def take(self, eye: Array, center: Array, agreement: float, farther: float, roll_rad: float = 0.0) -> None:
+    def take(self, eye: Array, center: Array, agreement: float, farther: float, aside_rad: float = 0.0) -> None:
         """Takes the agreement of the view from `eye` [3] of an object at `center` [3] (m, world), how many times
-        farther the goal image shows it, and by what angle the image is turned to the right against the goal image.
+        farther the goal image shows it, and by how much larger the azimuth of the goal's view seems to be.
 
-        Seen from above, another azimuth turns the image, so that the angle tells the goal's azimuth.
+        A view that agrees in part, from beside the goal's direction, makes the direction worth a look to which it
+        points; what is seen there decides.
         """
-        _, elevation, _ = spherical(eye, center)
-        log_ratio = WITHOUT + PER_AGREEMENT * agreement
-        is_told = log_ratio > 0.0 and elevation > FROM_ABOVE_RAD
         towards = unit(eye - center)
         self._looks = [look for look in self._looks if unit(look.eye - center) @ towards < np.cos(SAME_RAD)]
-        aside_rad = -roll_rad / float(np.sin(elevation)) if is_told else 0.0
-        self._looks.append(Look(np.array(eye), log_ratio, farther, aside_rad))
+        log_ratio = WITHOUT + PER_AGREEMENT * agreement
+        points = agreement > IN_PART and BESIDE_RAD[0] < abs(aside_rad) < BESIDE_RAD[1]
+        if points and log_ratio < WORTH_A_LOOK:
+            log_ratio = min(log_ratio + PER_AGREEMENT * abs(aside_rad), WORTH_A_LOOK)
+        self._looks.append(Look(np.array(eye), log_ratio, farther, aside_rad if points else 0.0,
+                                agreement))
 
     def carried(self, move_m: Array) -> None:
         """Moves the views along with an object that drifts by `move_m` [3] (metres)."""
@@ -71,9 +78,11 @@ class Looks:
         aside = azimuth[:, None] - at_azimuth - np.array([look.aside_rad for look in self._looks])
         around = np.min([np.abs(wrap(aside + equal)) for equal in self._equal_rad], axis=0)
         way = np.hypot(up, around)  # [E, A, looks]: near the pole, too, a change of azimuth rotates the image
-        nearest = way.argmin(-1)
+        later = np.array([FIRST_RAD if look.aside_rad else 0.0 for look in self._looks])  # what is seen there decides
+        nearest = (way + later).argmin(-1)
         ratios = np.array([look.log_ratio for look in self._looks])[nearest]
-        return np.asarray(ratios * np.exp(-0.5 * (way.min(-1) / AROUND_RAD) ** 2))
+        nearest_way = np.take_along_axis(way, nearest[..., None], -1)[..., 0]
+        return np.asarray(ratios * np.exp(-0.5 * (nearest_way / AROUND_RAD) ** 2))
 
     def range_m(self, center: Array) -> float | None:
         """The range (m) at which the goal image shows the object, by the comparison that agrees best. None if none
@@ -81,7 +90,7 @@ class Looks:
 
         In two views from one direction the networks make the same error of the size, so that their ratio is exact.
         """
-        best = max(self._looks, key=lambda look: look.log_ratio, default=None)
-        if best is None or best.log_ratio < 0.0:
+        best = max(self._looks, key=lambda look: look.agreement, default=None)
+        if best is None or WITHOUT + PER_AGREEMENT * best.agreement < 0.0:
             return None
         return float(np.linalg.norm(best.eye - center)) * best.farther

@@ -161,7 +161,7 @@ class Perception:
         for k, name in enumerate(self.names):
             told, agrees = percept(frame, name, seen, k, frame.world_from_camera), self._agreement(k, frame, seen)
             if agrees is not None:
-                told = replace(told, goal_agreement=agrees.share, goal_roll_rad=agrees.roll_rad)
+                told = replace(told, goal_agreement=agrees.share, goal_aside_rad=agrees.aside_rad)
             yield Output(PERCEPT, told, name)
 
     def _agreement(self, k: int, frame: Frame, seen: Seen) -> Agreement | None:

@@ -31,16 +31,18 @@ ASIDE_RAD, LARGER = 0.15, 0.25  # chosen: how far from the goal's place, and by 
 MARGIN_PX = 4  # chosen: features within this of the object's mask are its own
 FEWEST = 3  # pairs that tell an affine map
 SHIFTED = 0.12  # chosen: pairs that begin are shifted like their median, to this share of the crop's side
+FROM_ABOVE = 0.75  # chosen: sine of the elevation from which on the turn tells the azimuth, and not the shift
+SHIFT_PER_RAD = 0.12  # measured: how far a surface shifts in its crop, in crop sides
 USUAL, UNLIKE = 0.05, 0.1  # of colours in views from one direction, and how much more takes the e-th part of the share
 WITHIN = (0.08, 0.05, 0.03, 0.02, 0.02)  # chosen: the same for pairs that follow the map, from fit to fit
 
 
 class Agreement(NamedTuple):
     """The share (0 to 1) of an object's local features that agree, of those in the crop that has fewer, less where
-    colours do not, and by what angle they are turned to the right against the goal image."""
+    colours do not, and by how much larger than here the azimuth of the goal's view must be."""
 
     share: float
-    roll_rad: float
+    aside_rad: float
 
 
 class Shown(NamedTuple):
@@ -60,8 +62,8 @@ class SameView:
                  up: ArrayLike, seen: Seen):
         self._features, self._sides_m = features, np.asarray(sides_m, dtype=np.float64)
         self._intrinsics_px, self._seen = np.asarray(intrinsics_px), seen
-        known = map(int, np.flatnonzero(seen.presence > SHOWN))
-        self._shown = {k: self._of(k, rgb, intrinsics_px, up, seen) for k in known}
+        self._shown = {k: self._of(k, rgb, intrinsics_px, up, seen)
+                       for k, presence in enumerate(seen.presence) if presence > SHOWN}
 
     def __call__(self, k: int, rgb: NDArray[np.uint8], intrinsics_px: ArrayLike, up: ArrayLike,
                  seen: Seen) -> Agreement | None:
@@ -76,7 +78,8 @@ class SameView:
         count, affine = following(*((each.double().numpy() / SIDE_PX) for each in
                                     (there.features.pixels[rows], here.features.pixels[columns])))
         more = max(unlike(there.crop, here.crop, affine) - USUAL, 0.0) if count else 0.0
-        return Agreement(count / fewer * float(np.exp(-more / UNLIKE)), roll_of(affine))
+        return Agreement(count / fewer * float(np.exp(-more / UNLIKE)),
+                         aside_of(affine, intrinsics_px, up, seen.pixel[k]))
 
     def _may_be_same(self, k: int, intrinsics_px: ArrayLike, seen: Seen) -> bool:
         here, there = (unit(pixel_rays(one.pixel[k], px)) for one, px in
@@ -120,6 +123,19 @@ def following(there: NDArray[np.float64], here: NDArray[np.float64]) -> tuple[in
         affine = np.linalg.lstsq(places[follow], here[follow], rcond=None)[0]
         follow = np.linalg.norm(places @ affine - here, axis=1) < within
     return int(follow.sum()), affine
+
+
+def aside_of(affine: NDArray[np.float64], intrinsics_px: ArrayLike, up: ArrayLike, pixel: ArrayLike) -> float:
+    """By how much larger than here (rad) the azimuth of the view must be from which an object, seen at a pixel [2] by a
+    camera in which `up` [3] is up, looks as in the goal image.
+
+    Around an object that is seen from above, another azimuth turns the image; seen from the side, it shifts the
+    surface aside.
+    """
+    down = -float(unit(pixel_rays(pixel, intrinsics_px)) @ np.asarray(up, dtype=np.float64))
+    if down > FROM_ABOVE:
+        return -roll_of(affine) / down
+    return float(affine[:2, 0] @ (0.5, 0.5) + affine[2, 0] - 0.5) / SHIFT_PER_RAD
 
 
 def roll_of(affine: NDArray[np.float64]) -> float:

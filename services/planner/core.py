@@ -156,8 +156,8 @@ class Planner:
                 self.is_near = evidence.is_enough
                 declared = evidence.is_enough and self._is_at(eye, camera, evidence)
                 if not self.is_near:
-                    self._has_looked(target, camera, evidence.look,
-                                     wrong=not evidence.rival or evidence.probability < UNLIKELY)
+                    self._has_looked(target, camera, evidence.look, wrong=not evidence.is_beside and (
+                        not evidence.rival or evidence.probability < UNLIKELY))
         self.age += 1
         due = chosen is None or arrived or mode != chosen.mode or self.age >= self._patience
         return due, declared

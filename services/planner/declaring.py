@@ -17,6 +17,7 @@ from saccade.shared.world.geometry import Array, direction, unit, viewing_grid
 
 CERTAIN = 0.9  # chosen: beside a rival, or if the target is hidden, the posterior must be so sure
 ALIKE = 0.38  # chosen: so well a view must agree; nearly all from the goal's direction do, and no back of a can
+IN_PART = 0.3  # chosen: a view that agrees so well is not given up, but the agent looks beside it
 SURE = 0.6  # chosen: the agent says so if looks and fused views together leave at least this probability
 UNLIKELY = 0.25  # chosen: a view that has a lower probability is not the goal's
 CLEAR = 0.93  # chosen: looks that are clearer than this need no look at rivals; a view that may be wrong reaches 0.95
@@ -43,6 +44,11 @@ class Evidence(NamedTuple):
         if self.agreement is not None:
             return self.fused if self.agreement > ALIKE else 0.0
         return together(self.look, self.fused if self.elsewhere < UNLIKELY else 1.0 - self.elsewhere)
+
+    @property
+    def is_beside(self) -> bool:
+        """Whether the view agrees in part, so that the goal's may be beside it."""
+        return self.agreement is not None and self.agreement > IN_PART
 
     @property
     def is_enough(self) -> bool:

@@ -136,8 +136,9 @@ class Percept(Message):
     goal_agreement: float | None = None
     """Share of the object's local features that agree with those in the goal image, where both are compared: where the
     object is about as large and about at the same place in the image."""
-    goal_roll_rad: float | None = None
-    """By what angle these features are turned to the right, against those in the goal image."""
+    goal_aside_rad: float | None = None
+    """By how much the azimuth of the goal's view is larger than that of this one, as these features are turned and
+    shifted."""
 
     def mask(self) -> np.ndarray | None:
         """Where in the image the object is seen: truth values [M, M]. None if the message has no mask."""

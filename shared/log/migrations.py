@@ -84,7 +84,7 @@ def with_motion_and_comparisons() -> Change:
     """Format 6 to 7: a belief may tell how the goal's camera was rolled, how an object moves, and, as a percept may,
     how well the present view agrees with the goal image. The topic `events` is new."""
     added: dict[type[m.Message], Fields] = {
-        m.Percept: {"version": 5, "goal_agreement": None, "goal_roll_rad": None},
+        m.Percept: {"version": 5, "goal_agreement": None, "goal_aside_rad": None},
         m.Belief: {"version": 2, "goal_rotations": None, "goal_rotations_log_probability": None, "velocity_m": None,
                    "since_step": 0, "goal_agreement": None}}
 
