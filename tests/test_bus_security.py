@@ -85,9 +85,9 @@ bus.close()
 """
 # What is meant, written down once more: who publishes what beside its own status, and who reads what
 SAYS = {"simulator": {"frame", "goal", "truth"}, "camera": {"frame", "goal"}, "perception": {"percept", "goal_percept"},
-        "belief": {"belief"}, "planner": {"plan", "action"}, "evaluator": {"result"}, "recorder": set(),
+        "belief": {"belief", "events"}, "planner": {"plan", "action"}, "evaluator": {"result"}, "recorder": set(),
         "director": set(), "viewer": set()}
-SEEN = {"frame", "goal", "percept", "belief", "plan", "truth", "result", "status"}
+SEEN = {"frame", "goal", "percept", "belief", "events", "plan", "truth", "result", "status"}
 HEARS = {"simulator": {"action", "result", "status"}, "camera": {"action", "status"},
          "perception": {"frame", "goal", "percept", "goal_percept"}, "belief": {"percept", "goal_percept", "goal"},
          "planner": {"belief", "goal_percept", "goal"}, "evaluator": {"truth"}, "recorder": set(TOPICS), "viewer": SEEN,
