@@ -195,8 +195,11 @@ class Planner:
                         self.rivals.elsewhere(camera, target.mean_m), target.goal_agreement)
 
     def _is_at(self, eye: Array | None, camera: Array, evidence: Evidence) -> bool:
-        """Whether the camera is where the goal's view is believed to be, `eye` [3], now that it was compared."""
-        return eye is None or evidence.agreement is None or bool(np.linalg.norm(eye - camera[:3, 3]) < THERE_M)
+        """Whether the camera is where the goal's view is believed to be, `eye` [3], now that it was compared. Where
+        nobody follows the plan, the task's tolerance was enough to arrive."""
+        if eye is None or evidence.agreement is None or self.moved_by == "recording":
+            return True
+        return bool(np.linalg.norm(eye - camera[:3, 3]) < THERE_M)
 
     def _has_looked(self, target: Belief, camera: Array, look: float, *, wrong: bool) -> None:
         """The agent has arrived and looked, and goes on: to a rival, if the view may be the goal's all the same."""
