@@ -7,7 +7,8 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from saccade.shared.bus.messages import Message, field_types
+from saccade.shared.bus.messages import Message, Percept, field_types
+from saccade.shared.world.geometry import INTRINSICS_PX
 
 DIMENSIONS = {"H": 4, "W": 5, "L": 8, "N": 3, "E": 6, "A": 7, "M": 10, "B": 2, "R": 4, "G": 2}
 VALUES = {str: "mug", int: 3, float: 0.5, bool: True, list[str]: ["mug", "can"]}
@@ -16,6 +17,14 @@ VALUES = {str: "mug", int: 3, float: 0.5, bool: True, list[str]: ["mug", "can"]}
 def sample(message_type: type[Message], **changes: Any) -> Message:
     """Every field filled, also the optional ones."""
     return message_type(**{name: _value(hint) for name, hint in field_types(message_type).items()} | changes)
+
+
+def goal_percept(name: str) -> Percept:
+    """What a goal image says that shows an object in its middle, 0.40 m away, and tells nothing of its pose."""
+    return Percept(run="r", episode=0, step=0, object=name, presence=1.0, pixel=np.array([240.0, 240.0]), pixel_std=2.0,
+                   scale=1.0, log_scale_std=0.05, latent_mean=np.zeros(0, np.float32),
+                   latent_std=np.zeros(0, np.float32), intrinsics_px=np.array(INTRINSICS_PX),
+                   world_from_camera=np.eye(4))
 
 
 def array_fields(message_type: type[Message]) -> list[str]:

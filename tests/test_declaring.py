@@ -13,6 +13,7 @@ from saccade.shared.bus.messages import Belief, Percept
 from saccade.shared.config import Config
 from saccade.shared.world.geometry import INTRINSICS_PX, look_at, unit, viewing_grid, wrap
 from saccade.shared.world.symmetry import NONE
+from saccade.tests.samples import goal_percept
 
 NAME, CENTER = "soup_can", np.array([0.0, 0.0, 0.05])
 STAMP = {"run": "r", "episode": 0}
@@ -98,12 +99,6 @@ def test_a_direction_that_was_once_likely_stays_a_rival_until_it_was_looked_from
     assert alone.beside(FRONT, CENTER) is None
 
 
-def goal() -> Percept:
-    return Percept(**STAMP, step=0, object=NAME, presence=1.0, pixel=np.array([240.0, 240.0]), pixel_std=2.0, scale=1.0,
-                   log_scale_std=0.05, latent_mean=np.zeros(0, np.float32), latent_std=np.zeros(0, np.float32),
-                   intrinsics_px=np.array(INTRINSICS_PX), world_from_camera=np.eye(4))
-
-
 def test_the_planner_looks_from_the_rival_side_and_comes_back_to_say_that_it_is_there():
     """The looks from the front leave a doubt, and those from the back say that it is not there."""
     planner = build(Config().with_values({"scene.names": [NAME], "planner.candidates": 30}))
@@ -114,7 +109,8 @@ def test_the_planner_looks_from_the_rival_side_and_comes_back_to_say_that_it_is_
     def plan_at(camera, log_posterior, look):
         nonlocal step
         said = belief(step, camera, log_posterior, look)
-        plan, _ = (output.message for output in planner.step({"belief": {NAME: said}, "goal_percept": {NAME: goal()}}))
+        inputs = {"belief": {NAME: said}, "goal_percept": {NAME: goal_percept(NAME)}}
+        plan, _ = (output.message for output in planner.step(inputs))
         step += 1
         return plan
 

@@ -8,10 +8,10 @@ import numpy as np
 
 from saccade.services.planner.core import build
 from saccade.services.planner.moving import OFTEN, ahead, carried
-from saccade.shared.bus.messages import Belief, Percept, Plan
+from saccade.shared.bus.messages import Belief, Plan
 from saccade.shared.config import Config
-from saccade.shared.world.geometry import INTRINSICS_PX, direction, look_at, viewing_grid
-from saccade.tests.samples import sample
+from saccade.shared.world.geometry import direction, look_at, viewing_grid
+from saccade.tests.samples import goal_percept, sample
 
 NAME, CENTER, STAMP = "soup_can", np.array([0.05, 0.0, 0.05]), {"run": "r", "episode": 0}
 SIDE = look_at(CENTER + 0.4 * direction(-1.5, 0.5), CENTER)
@@ -29,12 +29,6 @@ def belief(step, camera, *, center=CENTER, velocity_m=None, since_step=0, here=0
                   since_step=since_step)
 
 
-def goal() -> Percept:
-    return Percept(**STAMP, step=0, object=NAME, presence=1.0, pixel=np.array([240.0, 240.0]), pixel_std=2.0, scale=1.0,
-                   log_scale_std=0.05, latent_mean=np.zeros(0, np.float32), latent_std=np.zeros(0, np.float32),
-                   intrinsics_px=np.array(INTRINSICS_PX), world_from_camera=np.eye(4))
-
-
 def planner():
     made = build(Config().with_values({"scene.names": [NAME], "planner.candidates": 30}))
     made.begin("r", 0)
@@ -42,7 +36,8 @@ def planner():
 
 
 def plan_of(made, said: Belief) -> Plan:
-    plan, _ = (output.message for output in made.step({"belief": {NAME: said}, "goal_percept": {NAME: goal()}}))
+    inputs = {"belief": {NAME: said}, "goal_percept": {NAME: goal_percept(NAME)}}
+    plan, _ = (output.message for output in made.step(inputs))
     return plan
 
 
@@ -67,7 +62,7 @@ def test_the_viewpoint_of_a_target_that_drifts_is_chosen_anew_more_often():
 def test_when_the_target_was_moved_the_plan_is_made_anew_and_what_was_tried_is_forgotten():
     made, moved_to = planner(), CENTER + np.array([-0.2, 0.1, 0.0])
     first = plan_of(made, belief(0, SIDE))
-    plan_of(made, belief(1, first.viewpoint))  # it has arrived, and the view is not the goal's
+    plan_of(made, belief(1, first.viewpoint, here=0.01))  # it has arrived, and the view is not the goal's
     assert len(made.visited) == 1
     unmoved = plan_of(made, belief(2, SIDE, center=moved_to))
     moved = plan_of(made, belief(3, SIDE, center=moved_to, since_step=3))

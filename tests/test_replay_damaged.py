@@ -14,7 +14,7 @@ from saccade.app.log.recover import recover
 from saccade.app.replay.replay import prepare, replay_here, replay_on_bus
 from saccade.app.replay.report import replay_all, tell
 from saccade.services.replayer.core import Keys, Pace
-from saccade.shared.bus.topics import ACTION, BELIEF, FRAME, GOAL, PERCEPT, PLAN
+from saccade.shared.bus.topics import ACTION, BELIEF, EVENTS, FRAME, GOAL, PERCEPT, PLAN
 from saccade.shared.bus.wire import decode, encode, stamp_of
 from saccade.shared.errors import SaccadeError
 from saccade.shared.log.reading import RunReader
@@ -22,7 +22,7 @@ from saccade.shared.log.recording import LOG, RunLog
 from saccade.tests.fixtures.make import GOLDEN
 
 INTO = ("perception", "belief", "planner")
-AGENT = (PERCEPT, BELIEF, PLAN, ACTION)
+AGENT = (PERCEPT, BELIEF, EVENTS, PLAN, ACTION)
 
 
 def damaged(path, *, lost=(), cut=None, changed=None):
