@@ -10,7 +10,6 @@ the reliability curves lies beside it.
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -28,18 +27,17 @@ from saccade.shared.bus.messages import Belief, Message, Percept, Truth
 from saccade.shared.bus.topics import GOAL_PERCEPT, PERCEPT, Topic
 from saccade.shared.config import load
 from saccade.shared.errors import SaccadeError
-from saccade.shared.files import replace_whole, writing
+from saccade.shared.files import write_json
 from saccade.shared.log.provenance import commit
 from saccade.shared.loop.local import run_local
 from saccade.shared.render.objects import load_mesh
-from saccade.shared.world.geometry import direction, viewing_grid, yaw_rotation
+from saccade.shared.world.geometry import direction, viewing_grid
 from saccade.shared.world.sight import IN_VIEW, seen_shares
 from saccade.shared.world.task import success
-from saccade.shared.world.workspace import Boxes
+from saccade.shared.world.workspace import NO_BOXES, Boxes
 
 BINS = 10
 DRAWN = 200  # goal poses that are drawn from a belief
-NO_BOXES = Boxes(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3)))
 KINDS = {"percept": "the object is in the image", "belief": "the object is on the table",
          "within": "the camera is within the tolerance"}
 
@@ -93,21 +91,19 @@ class Listener:
     def told(self) -> dict[str, list[Told]]:
         """What was told in the episode, and what was so."""
         preference = infer_preference(self.goals, self.range_std_m)
+        shares = {step: self._shares(truth) for step, truth in self.truths.items()}
         percepts = [Told(p.presence, share > 0) for p in self.percepts
-                    if (share := self._share(p)) == 0 or share >= IN_VIEW]
+                    if (share := shares[p.step].get(p.object, 0.0)) == 0 or share >= IN_VIEW]
         beliefs = [Told(b.presence, b.object in self.truths[b.step].names) for b in self.beliefs]
         within = [Told(within_tolerance(b, preference, self.rng),
                        success(b.world_from_camera, self.truths[b.step].goal_world_from_camera))
                   for b in self.beliefs if b.object == preference.target]
         return {"percept": percepts, "belief": beliefs, "within": within}
 
-    def _share(self, percept: Percept) -> float:
-        truth = self.truths[percept.step]
-        if percept.object not in truth.names:
-            return 0.0
-        boxes = Boxes(truth.centers_m, np.array([yaw_rotation(float(yaw)) for yaw in truth.yaws_rad]),
-                      np.array([self.sizes_m[name] for name in truth.names]))
-        return float(seen_shares(truth.world_from_camera, boxes, NO_BOXES)[truth.names.index(percept.object)])
+    def _shares(self, truth: Truth) -> dict[str, float]:
+        """The share of each object on the table that is seen."""
+        boxes = Boxes(truth.centers_m, truth.world_from_objects(), np.array([self.sizes_m[n] for n in truth.names]))
+        return dict(zip(truth.names, seen_shares(truth.world_from_camera, boxes, NO_BOXES).tolist(), strict=True))
 
 
 def reliability(told: Sequence[Told]) -> dict[str, Any]:
@@ -170,8 +166,7 @@ def main() -> None:
     options, console = parser.parse_args(), Console()
     try:
         results = measure(options, console)
-        with writing(options.out, "results"):
-            replace_whole(options.out, (json.dumps(results, indent=1) + "\n").encode())
+        write_json(options.out, results, "results")
         draw(results, options.out.with_suffix(".png"))
     except SaccadeError as error:
         parser.exit(2, f"saccade: {error}\n")

@@ -9,7 +9,6 @@ way, because networks that know nothing would take no stranger for their own eit
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,7 @@ from saccade.app.run.registry import agent_of
 from saccade.services.perception.core import Model, model_of
 from saccade.shared.config import load
 from saccade.shared.errors import SaccadeError
-from saccade.shared.files import replace_whole, writing
+from saccade.shared.files import write_json
 from saccade.shared.log.provenance import commit
 from saccade.shared.model.weights import weights_in_use
 from saccade.shared.render.mesh import Mesh, read_obj
@@ -99,8 +98,7 @@ def main() -> None:
     options, console = parser.parse_args(), Console()
     try:
         results = measure(options, console)
-        with writing(options.out, "results"):
-            replace_whole(options.out, (json.dumps(results, indent=1) + "\n").encode())
+        write_json(options.out, results, "results")
     except SaccadeError as error:
         parser.exit(2, f"saccade: {error}\n")
     for kind in ("strangers", "known"):

@@ -175,6 +175,13 @@ def replace_whole(path: Path, data: bytes) -> None:
     replace_all(path.parent, {path.name: data})
 
 
+def write_json(path: Path, tree: Any, what: str) -> None:
+    """Writes a tree as JSON, in place of what was there. Raises SaccadeError, which says `what` it is, if this
+    fails."""
+    with writing(path, what):
+        replace_whole(path, (json.dumps(tree, indent=1) + "\n").encode())
+
+
 def replace_all(folder: Path, contents: Mapping[str, bytes]) -> None:
     """Writes several files of a folder. If one of them cannot be written, all stay as they were. Raises OSError."""
     drafts = {folder / name: folder / f"{name}.part" for name in contents}

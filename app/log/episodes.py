@@ -84,7 +84,7 @@ class Step(_Messages):
 
     @property
     def events(self) -> Events | None:
-        """What the belief noticed in the frame: what was moved, turned, taken away or put back, and what drifts."""
+        """What the belief noticed in the frame: what was moved, taken away or put back, and what drifts."""
         return self._get(EVENTS)
 
     @property

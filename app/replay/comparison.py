@@ -140,6 +140,10 @@ def _size(topic: str, name: str, old: Any, new: Any) -> tuple[float, bool]:
     if allowed.flipped is not None:
         share = float(np.unpackbits(old ^ new).mean())
         return share, share <= allowed.flipped
+    if allowed.spread is not None:
+        moments = [np.array([points.mean(0), points.std(0)], np.float64) for points in (old, new)]
+        off = np.abs(moments[1] - moments[0])
+        return float(off.max()), bool((off <= allowed.absolute + allowed.spread * moments[0][1]).all())
     apart = np.abs(np.asarray(new, np.float64) - np.asarray(old, np.float64))
     within = apart <= allowed.absolute + allowed.relative * np.abs(np.asarray(old, np.float64))
     return float(apart.max(initial=0.0)), bool(within.all())

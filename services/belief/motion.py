@@ -18,7 +18,7 @@ from saccade.services.belief.position import WORKSPACE_M, Evidence
 
 Array = NDArray[np.float64]
 State = Literal["rests", "drifts", "gone"]
-Kind = Literal["moved", "turned", "gone", "back", "drifts", "rests"]
+Kind = Literal["moved", "gone", "back", "drifts", "rests"]
 
 RATE = 0.01  # chosen: probability that something happens to an object, in a step
 LEAST_OUTLIER = 0.02  # chosen: least probability that a percept is of something else

@@ -42,15 +42,17 @@ class Cropper:
 
     def fine(self, window: Window, side_px: int) -> Tensor:
         """Larger crops [K, 3, S, S] of S = `side_px`. Outside the image the border goes on."""
+        return self._fine(*self._sampled(window, side_px))
+
+    def fine_masked(self, window: Window, side_px: int) -> tuple[Tensor, Tensor]:
+        """The same crops, and their masks [K, S, S]."""
         grid, levels = self._sampled(window, side_px)
+        return self._fine(grid, levels), F.grid_sample(self.masks[:, None], grid, align_corners=False)[:, 0]
+
+    def _fine(self, grid: Tensor, levels: NDArray[np.int64]) -> Tensor:
         crops = [F.grid_sample(self.pyramid[level], each[None], mode="bicubic", padding_mode="border",
                                align_corners=False) for level, each in zip(levels, grid, strict=True)]
         return torch.cat(crops).clamp(0.0, 1.0)
-
-    def mask(self, window: Window, side_px: int) -> Tensor:
-        """The masks of crops as large as those of `fine` [K, S, S]."""
-        grid, _ = self._sampled(window, side_px)
-        return F.grid_sample(self.masks[:, None], grid, align_corners=False)[:, 0]
 
     def _sampled(self, window: Window, side_px: int) -> tuple[Tensor, NDArray[np.int64]]:
         """Where side_px x side_px samples of the crops lie in the image [K, side_px, side_px, 2], from -1 to 1, and the

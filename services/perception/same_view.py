@@ -94,7 +94,7 @@ class SameView:
         mask = torch.from_numpy(mask_of(seen.mask_bits[k])).float()[None]
         cropper = Cropper(image, mask, intrinsics_px, up)
         window = Window(seen.pixel[k, None], seen.scale[k, None], self._sides_m[k, None])
-        crop, own_mask = cropper.fine(window, SIDE_PX), cropper.mask(window, SIDE_PX)
+        crop, own_mask = cropper.fine_masked(window, SIDE_PX)
         found, own = self._features(crop, MOST)[0], _widened(own_mask[0])
         column, row = found.pixels.long().clamp(0, SIDE_PX - 1).T
         inside = own[row, column]

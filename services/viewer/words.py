@@ -25,8 +25,7 @@ def decision(plan: Plan, beliefs: Iterable[Belief]) -> str:
     return f"approach: the goal's view of the {plain(plan.target)}"
 
 
-HAPPENED = {"moved": "was moved", "turned": "was turned", "gone": "is gone", "back": "is back", "drifts": "drifts",
-            "rests": "rests again"}
+HAPPENED = {"moved": "was moved", "gone": "is gone", "back": "is back", "drifts": "drifts", "rests": "rests again"}
 
 
 def happened(events: Events) -> list[str]:

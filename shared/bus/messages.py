@@ -182,8 +182,8 @@ class Belief(Message):
     velocity_m: Annotated[np.ndarray, array("f8", 3)] | None = None
     """Its velocity (world), metres a step. Absent while it is believed to rest."""
     since_step: int = 0
-    """Step since which it is believed to be as it is: at which it was last noticed to be moved, turned or back. 0 if
-    nothing has happened to it."""
+    """Step since which it is believed to be as it is: at which it was last noticed to be moved or back. 0 if nothing
+    has happened to it."""
     goal_agreement: float | None = None
     """Share of the local features of the present view that agree with those of the goal image, where both are compared.
     The posterior takes it into account."""
@@ -206,13 +206,12 @@ class Belief(Message):
 
 @dataclass(frozen=True, kw_only=True)
 class Events(Message):
-    """What the belief noticed with one image: objects that are not where they were, or not as they were. Mostly there
-    are none."""
+    """What the belief noticed with one image: objects that are not where they were. Mostly there are none."""
 
     objects: list[str]
     """Names of the objects, one for each event."""
     kinds: list[str]
-    """What happened to each: `moved`, `turned`, `gone`, `back`, `drifts`, or `rests` after it has drifted."""
+    """What happened to each: `moved`, `gone`, `back`, `drifts`, or `rests` after it has drifted."""
     positions_m: Annotated[np.ndarray, array("f8", "N", 3)]
     """Where each is believed to be now; of one that is gone, where it was."""
     probabilities: Annotated[np.ndarray, array("f8", "N")]

@@ -58,8 +58,7 @@ RESULT = Topic("result", m.Result, latched=True)
 STATUS = Topic("status", m.Status, parts=True, in_step=False)
 
 TOPICS: dict[str, Topic] = {topic.name: topic for topic in (
-    FRAME, GOAL, PERCEPT, GOAL_PERCEPT, BELIEF, EVENTS, PLAN, ACTION, TRUTH, RESULT,
-    STATUS)}
+    FRAME, GOAL, PERCEPT, GOAL_PERCEPT, BELIEF, EVENTS, PLAN, ACTION, TRUTH, RESULT, STATUS)}
 
 
 def parse_key(key: str) -> tuple[str, Topic, str | None]:
