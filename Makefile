@@ -7,9 +7,12 @@ SACCADE = .venv/bin/saccade
 run: .venv/.installed
 	$(SACCADE) run --view
 
-# Two files at a time: many tests wait for processes.
+# Two files at a time: many tests wait for processes. The viewer's page comes alone: a viewer gets only what the other
+# processes leave of the processors, and beside a second file of tests that may be nothing.
+PAGE = tests/test_viewer_page.py
 test: .venv/.installed-dev lint
-	.venv/bin/python -m pytest -q --numprocesses 2 --dist loadfile
+	.venv/bin/python -m pytest -q --numprocesses 2 --dist loadfile --ignore=$(PAGE)
+	.venv/bin/python -m pytest -q $(PAGE)
 
 # As the user who calls it; root has the containers run as user 1000.
 up:

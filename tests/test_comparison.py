@@ -10,7 +10,7 @@ from rich.console import Console
 
 from saccade.app import provenance
 from saccade.app.bench import comparison
-from saccade.app.bench.comparison import cells, compare
+from saccade.app.bench.comparison import Cell, cells, compare, core_hours
 from saccade.app.bench.table import PAPER_AGENTS, PAPER_ROOM
 from saccade.benchmarks.from_paper import STEPS, page, value_of
 from saccade.shared.config import Config, load
@@ -34,6 +34,14 @@ def test_the_page_has_a_row_for_each_agent_and_its_pictures(written):
     for picture in ("errors_lexa-room.png", "final_views.png"):
         assert picture in page
         assert (written / picture).stat().st_size > 5000
+
+
+def test_the_time_of_all_scenes_is_told_at_the_pace_of_the_measured_ones(tmp_path, written):
+    slow, fast = Cell("slow", "paper-500", tmp_path), Cell("fast", "paper-500", tmp_path)
+    found = {cell: SimpleNamespace(records=[{"seconds": s} for s in seconds])
+             for cell, seconds in ((slow, (20.0, 52.0)), (fast, (7.2,)))}
+    assert core_hours(found, {slow: 500, fast: 100}) == pytest.approx(5.2)
+    assert "all scenes of this table take 0." in (written / "table.md").read_text()
 
 
 def test_what_is_there_is_not_run_again_and_more_scenes_are(written, monkeypatch):

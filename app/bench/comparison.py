@@ -10,6 +10,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from statistics import fmean
 
 from rich.console import Console
 
@@ -72,7 +73,8 @@ def compare(out: Path, objects: str, *, agents: Sequence[str] | None = None, lim
         if not _is_there(plan, command):
             say(console, f"{cell.agent} on {cell.suite}")
             bench(plan, jobs=jobs, command=command, console=console, cluster=cluster)
-    write_page(out, {cell: read_results(cell.path) for cell in wanted}, console)
+    write_page(out, {cell: read_results(cell.path) for cell in wanted},
+               {cell: len(plan.scenes) for cell, plan in plans.items()}, console)
     return [cell.path for cell in wanted]
 
 
@@ -89,8 +91,8 @@ def _configuration(agent: str, objects: str) -> Config:
     return load(None, AGENTS[agent].preset).with_values({"scene.objects": objects})
 
 
-def write_page(out: Path, found: dict[Cell, Results], console: Console) -> None:
-    """Writes table.md and its pictures from results files."""
+def write_page(out: Path, found: dict[Cell, Results], scenes: dict[Cell, int], console: Console) -> None:
+    """Writes table.md and its pictures from results files. `scenes` says how many scenes each suite has."""
     lines = ["# All agents, side by side", "",
              "Success with Wilson's 95 % interval; errors of the last view, mean ± standard error; milliseconds per "
              "step of perception, belief and planner together. The paper's figures stand below ours.", ""]
@@ -102,7 +104,9 @@ def write_page(out: Path, found: dict[Cell, Results], console: Console) -> None:
         lines += [f"![Errors of azimuth, elevation and range on {suite}]({picture.name})", ""]
         if suite != ROOM:
             lines += [*by_target(mine), ""]
-    lines += ["## What each agent has", "", *budgets(found), ""]
+    lines += ["## What each agent has", "", *budgets(found), "",
+              f"At the pace of these results, all scenes of this table take {core_hours(found, scenes):.1f} hours of one "
+              "core.", ""]
     room = {cell.agent: results for cell, results in found.items() if cell.suite == ROOM}
     if room:
         draw_final_views(_final_views(room, console), out / "final_views.png")
@@ -143,6 +147,12 @@ def by_target(results: dict[str, Results]) -> list[str]:
                   for t, records in zip(targets, each, strict=True)]
         lines.append(f"| {agent} | " + " | ".join(shares) + " |")
     return lines
+
+
+def core_hours(found: dict[Cell, Results], scenes: dict[Cell, int]) -> float:
+    """Hours of one core for all `scenes`, if they take as long as those that were measured."""
+    return sum(count * fmean(record["seconds"] for record in found[cell].records)
+               for cell, count in scenes.items()) / 3600
 
 
 def budgets(found: dict[Cell, Results]) -> list[str]:
