@@ -105,8 +105,8 @@ def write_page(out: Path, found: dict[Cell, Results], scenes: dict[Cell, int], c
         if suite != ROOM:
             lines += [*by_target(mine), ""]
     lines += ["## What each agent has", "", *budgets(found), "",
-              f"At the pace of these results, all scenes of this table take {core_hours(found, scenes):.1f} hours of one "
-              "core.", ""]
+              "At the pace of these results, all scenes of this table take "
+              f"{core_hours(found, scenes):.1f} hours of one core.", ""]
     room = {cell.agent: results for cell, results in found.items() if cell.suite == ROOM}
     if room:
         draw_final_views(_final_views(room, console), out / "final_views.png")
