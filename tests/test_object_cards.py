@@ -26,6 +26,8 @@ from saccade.shared.world.symmetry import CONTINUOUS, NONE
 from saccade.tests.fakes.shapes import box, can, labelled
 from saccade.tests.front_door import call
 
+pytestmark = pytest.mark.usefixtures("small_banks")
+
 
 @pytest.fixture
 def console():
@@ -99,7 +101,7 @@ def test_a_new_object_leaves_the_files_of_the_others_untouched(home, console):
     show_object("my", "oil", console, home / "page")
     page = (home / "page" / "oil.md").read_text()
     for words in ("| turned about the vertical | looks different from each side |", "| source | x.obj |",
-                  "1. **tea**, ", "| oil | tea |", "The bank holds 300 views"):
+                  "1. **tea**, ", "| oil | tea |", "The bank holds 120 views"):
         assert words in page
     for picture in ("oil-turntable.png", "oil-views.png", "oil-like-1.png"):
         assert f"({picture})" in page

@@ -41,7 +41,7 @@ def mesh():
 
 
 @pytest.fixture(scope="module")
-def bank(mesh):
+def bank(mesh, small_banks):
     torch.manual_seed(0)
     return bank_from(mesh, ViewEncoder().eval(), LocalFeatures(), count=120)
 

@@ -32,6 +32,8 @@ from saccade.shared.render.groceries import grocery
 from saccade.shared.render.mesh import read_obj
 from saccade.shared.render.objects import load_mesh, names_of
 
+pytestmark = pytest.mark.usefixtures("small_banks")
+
 
 @pytest.fixture
 def console():
@@ -56,7 +58,7 @@ def added(objects, *names):
 
 
 @pytest.fixture(scope="module")
-def learnt_once(tmp_path_factory):
+def learnt_once(tmp_path_factory, small_banks):
     """A set of two objects that is learnt, for all tests of this file."""
     from rich.console import Console
 
