@@ -17,7 +17,7 @@ from saccade.shared.bus.wire import (
     MAX_SMALL_BYTES,
     MAX_TEXT,
     MessageError,
-    _pack_array,
+    packed_array,
     decode,
     encode,
     stamp_of,
@@ -47,7 +47,7 @@ def wire(message: Message, **changes) -> bytes:
     """The message's map with some entries replaced (None of them checked) or, where the value is `...`, left out."""
     fields = {"type": type(message).__name__, "version": message.VERSION}
     fields |= {f.name: getattr(message, f.name) for f in dataclasses.fields(message)} | changes
-    return msgpack.packb({k: v for k, v in fields.items() if v is not ...}, default=_pack_array)
+    return msgpack.packb({k: v for k, v in fields.items() if v is not ...}, default=packed_array)
 
 
 @every_type

@@ -11,10 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import msgpack
+import numpy as np
 
 from saccade.shared.bus import messages as m
 from saccade.shared.bus.topics import Topic
-from saccade.shared.bus.wire import scan
+from saccade.shared.bus.wire import packed_array, scan
 from saccade.shared.errors import SaccadeError
 
 Fields = dict[str, Any]
@@ -94,9 +95,25 @@ def with_motion_and_comparisons() -> Change:
     return change
 
 
+def with_beliefs_of_instances() -> Change:
+    """Format 7 to 8: percepts and beliefs may be of several of a kind, and have numbers."""
+    added: dict[type[m.Message], Fields] = {
+        m.Percept: {"version": 6, "further": []},
+        m.Belief: {"version": 3, "instance": 1, "further": [], "count_probabilities": None},
+        m.Plan: {"version": 3, "target_instance": 1}}
+
+    def change(topic: Topic, part: str | None, fields: Fields) -> Fields:
+        if topic.type is m.Events:
+            numbers = np.ones(len(fields["objects"]), np.uint8)
+            return fields | {"version": 2, "instances": packed_array(numbers)}
+        return fields | added.get(topic.type, {})
+
+    return change
+
+
 CHANGES: tuple[Callable[[], Change], ...] = (count_in_episodes, with_masks_and_candidates, with_poses,
                                              with_several_rotations, with_places_and_instances,
-                                             with_motion_and_comparisons)
+                                             with_motion_and_comparisons, with_beliefs_of_instances)
 FORMAT = OLDEST + len(CHANGES)
 
 
