@@ -17,9 +17,9 @@ from saccade.shared.bus.wire import (
     MAX_SMALL_BYTES,
     MAX_TEXT,
     MessageError,
-    packed_array,
     decode,
     encode,
+    packed_array,
     stamp_of,
 )
 from saccade.tests.samples import array_fields, sample

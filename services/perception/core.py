@@ -84,7 +84,8 @@ class SceneCCN:
         drawn = self._by(self.decoder, mean[:, None], found.kinds)[:, 0]
         error = ((drawn * crop_masks - masked[:, :3]) ** 2).sum((1, 2, 3))
         return Seen(found.presence, window.pixels, found.side_px * deviation[:, :2].mean(1), window.scales,
-                    deviation[:, 2], mean.numpy(), std.numpy(), error.double().numpy(), found.mask_bits, kinds=found.kinds)
+                    deviation[:, 2], mean.numpy(), std.numpy(), error.double().numpy(), found.mask_bits,
+                    kinds=found.kinds)
 
     def _by(self, networks: Stacked, inputs: torch.Tensor, kinds: tuple[int, ...]) -> Any:
         """The outputs of networks for K objects, and for further ones of the objects `kinds`, [K + len(kinds), ...]."""
@@ -122,8 +123,8 @@ class SceneCCN:
         image = torch.from_numpy(np.array(rgb)).permute(2, 0, 1).float() / 255.0
         small = F.interpolate(image[None], size=(INPUT_PX, INPUT_PX), mode="area")
         focal_px = float(np.asarray(intrinsics_px)[0])
-        masks, vote_logits, votes, kinds = self._sorted(*(x[0, self.rows] for x in self.extraction(small)),
-                                                        focal_px / rgb.shape[1])
+        masks, vote_logits, votes = (x[0, self.rows] for x in self.extraction(small))
+        masks, vote_logits, votes, kinds = self._sorted(masks, vote_logits, votes, focal_px / rgb.shape[1])
         sides_m = np.concatenate([self.sides_m, self.sides_m[list(kinds)]]) if kinds else self.sides_m
         logit, center, log_scale = tally(vote_logits, votes)
         cropper = Cropper(image, masks.sigmoid(), intrinsics_px, up)

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-
 LIKELY = 0.5  # chosen: of the presence of the likeliest one of a kind
 
 

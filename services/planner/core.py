@@ -345,7 +345,8 @@ class Planner:
     def _plan(self, stamp: Belief, mode: str, viewpoint: Array, gaze: Array, terms: Terms, chosen: int) -> Plan:
         return Plan(
             run=stamp.run, episode=stamp.episode, step=stamp.step, mode=mode, viewpoint=viewpoint, look_at_m=gaze,
-            target=self.preference.target if self.preference else "", target_instance=self.target_instance, g_position=float(terms.position[chosen]),
+            target=self.preference.target if self.preference else "", target_instance=self.target_instance,
+            g_position=float(terms.position[chosen]),
             g_scale=float(terms.scale[chosen]), g_pose=float(terms.pose[chosen]),
             g_information=float(terms.information[chosen]), candidates=len(terms.position), believed_distance_m=-1.0,
             goal_confidence=self.confidence,

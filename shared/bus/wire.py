@@ -78,7 +78,8 @@ def _map_of(message: Message) -> dict[str, Any]:
     """The checked fields of a message, and of the messages that it lists."""
     fields = {f.name: getattr(message, f.name) for f in dataclasses.fields(message)}
     _check(type(message), fields)
-    for name, item_type in _lists(type(message)).items():
+    message_type: type[Message] = type(message)
+    for name, item_type in _lists(message_type).items():
         if any(type(item) is not item_type or any(getattr(item, n) for n in _lists(item_type))
                for item in fields[name]):
             raise MessageError(f"{name}: not messages of the type {item_type.__name__} that list no others")

@@ -22,7 +22,8 @@ Fields = dict[str, Any]
 Change = Callable[[Topic, str | None, Fields], Fields]
 
 OLDEST = 1  # the format of logs that do not name one
-ADDED = {m.Percept: ("mask_bits",), m.Plan: ("best_eyes_m", "best_g")}  # fields that older logs lack; they become None
+# Fields that older logs lack, and that services tell now; they become None.
+ADDED = {m.Percept: ("mask_bits",), m.Plan: ("best_eyes_m", "best_g"), m.Belief: ("count_probabilities",)}
 
 SINCE = {"events": 7}  # topics that older formats do not have, and the format since which they exist
 
@@ -43,7 +44,7 @@ def count_in_episodes() -> Change:
 def with_masks_and_candidates() -> Change:
     """Format 2 to 3: percepts have a mask of where the object is seen, and plans have their best candidates."""
     def change(topic: Topic, part: str | None, fields: Fields) -> Fields:
-        if topic.type not in ADDED:
+        if topic.type not in (m.Percept, m.Plan):
             return fields
         return fields | {"version": 2} | dict.fromkeys(ADDED[topic.type])
 
