@@ -23,6 +23,7 @@ BIRTH_LOG_ODDS = 2.0  # chosen: by so much more than its percept's an instance's
 APART = 0.9  # chosen: an instance is born only if it is farther than so many of its radii from all others
 VAGUE_M = 0.12  # chosen: no instance is born from a percept with a larger deviation
 DEAD_LOG_ODDS = -2.0  # chosen: an instance dies if its log odds of being there are lower, unless it is the last one
+LOST_M = 0.2  # chosen: nor is one kept whose place is not known to this deviation, while others are
 MOST = 8  # chosen: instances of a kind
 SAME = 0.6  # chosen: two instances nearer to each other than so many of their radii are one
 

@@ -12,6 +12,7 @@ from saccade.services.belief.association import (
     APART,
     BIRTH_LOG_ODDS,
     DEAD_LOG_ODDS,
+    LOST_M,
     MOST,
     SAME,
     VAGUE_M,
@@ -171,7 +172,8 @@ class BeliefFilter:
         instances = self.instances[name]
         gone = {instance.number for instance, change in changes if change.kind == "gone"
                 and instance.kind.name == name}
-        alive = [i for i in instances if i.number not in gone and i.position.log_odds > DEAD_LOG_ODDS]
+        alive = [i for i in instances if i.number not in gone and i.position.log_odds > DEAD_LOG_ODDS
+                 and np.trace(i.position.moments()[1]) < LOST_M ** 2]
         places, presences = [i.position.moments() for i in alive], [i.position.presence for i in alive]
         twice = doubles(places, presences, SAME * self.radius_m[name])
         alive = [instance for k, instance in enumerate(alive) if k not in twice]
