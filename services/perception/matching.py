@@ -21,7 +21,8 @@ LESS = 0.15  # chosen: of a similarity; one more of an object is not less like i
 def best_matches(count: int, pairs: Sequence[tuple[int, int, int]], log_odds: NDArray[np.float64],
                  fits: Mapping[tuple[int, int], Fit]) -> list[Match]:
     """Where each of `count` objects is likeliest, by pairs (object, thing, view). A thing is one object, or none of
-    them: `log_odds` are those against none. Where an object is sure to be in several things, as in the whole image and in a part of it, landmarks decide."""
+    them: `log_odds` are those against none. Where an object is sure to be in several things, as in the whole image and
+    in a part of it, landmarks decide."""
     odds = np.exp(np.clip(log_odds, -30, 30))
     best: dict[tuple[int, int], int] = {}  # the row of the likeliest view of each object in each thing
     for row, (k, thing, _) in enumerate(pairs):

@@ -121,10 +121,11 @@ class Planner:
 
     def _one_of_each(self, told: dict[str, Belief], camera: Array) -> dict[str, Belief]:
         """The beliefs about all instances, with the best one of the target's kind under the target's name."""
-        if self.preference is None or not (told[self.preference.target].further or self.target_instance != 1):
+        if self.preference is None:
             return flat(told, None, 1)
-        target, each = self.preference.target, told[self.preference.target].each()
-        scores = {}
+        target, each, scores = self.preference.target, told[self.preference.target].each(), {}
+        if [belief.instance for belief in each] == [self.target_instance]:
+            return flat(told, None, 1)
         for belief in each:
             beliefs = flat(told, target, belief.instance)
             ground = self._ground(beliefs)
