@@ -19,7 +19,7 @@ from saccade.tests.samples import goal_percept
 
 KIND = "soup_can"
 CANS = np.array([[0.10, 0.10, 0.05], [-0.12, 0.05, 0.05], [0.0, -0.15, 0.05]])
-NEAR = CANS[1:2]
+NEAR, FAR = CANS[1:2], CANS[0:1]  # told alone, in images that show nothing else
 
 
 def evidence(mean, deviation_m=0.01) -> Evidence:
@@ -86,8 +86,8 @@ def percept(step: int, camera, centers) -> Percept:
 def camera(step: int, centers):
     """A camera that sees the whole table; of one can alone it is near, so that the others are not in view."""
     angle = 0.25 * step
-    if centers is NEAR:
-        return look_at(NEAR[0] + np.array([0.05 * np.cos(angle), 0.05 * np.sin(angle), 0.25]), NEAR[0])
+    if centers is NEAR or centers is FAR:
+        return look_at(centers[0] + np.array([0.05 * np.cos(angle), 0.05 * np.sin(angle), 0.25]), centers[0])
     return look_at([0.55 * np.cos(angle), 0.55 * np.sin(angle), 0.45], [0.0, 0.0, 0.05])
 
 
@@ -138,6 +138,18 @@ def test_an_instance_dies_where_nothing_is_seen():
     assert len(told.each()) == 1
     assert np.linalg.norm(told.mean_m - CANS[0]) < 0.02
     assert told.count() == (1, pytest.approx(1.0, abs=0.01))
+
+
+def test_a_can_that_is_seen_where_it_was_before_and_elsewhere_is_two():
+    """No image shows both. The first is seen, then the other while the first is not in view, then the first again:
+    it may have been moved, so one instance is told; when it is seen where it was, there are two."""
+    moved, events = believed([CANS[:1]] * 6 + [NEAR] * 4)
+    assert moved.count()[0] == 1
+    assert events == [KIND]
+    told, _ = believed([CANS[:1]] * 6 + [NEAR] * 4 + [FAR] * 4)
+    assert told.count()[0] == 2
+    found = sorted(each.mean_m[0] for each in told.each())
+    np.testing.assert_allclose(found, [CANS[1][0], CANS[0][0]], atol=0.02)
 
 
 def test_a_can_that_is_there_once_is_one_instance_wherever_it_is_seen():

@@ -12,9 +12,11 @@ from saccade.services.belief.association import (
     APART,
     BIRTH_LOG_ODDS,
     DEAD_LOG_ODDS,
+    LEFT_LOG_ODDS,
     LOST_M,
     MOST,
     SAME,
+    SURE,
     VAGUE_M,
     assigned,
     count_probabilities,
@@ -22,7 +24,7 @@ from saccade.services.belief.association import (
     is_apart,
 )
 from saccade.services.belief.attitude import PoseLikeness
-from saccade.services.belief.instance import Instance, Kind, Others
+from saccade.services.belief.instance import Instance, Kind, Moments, Others
 from saccade.services.belief.motion import Change
 from saccade.services.belief.pose import GoalView, LatentLikeness, Likeness, TurnLikeness
 from saccade.services.belief.position import Evidence, PositionFilter, evidence_of, of_whole
@@ -66,6 +68,7 @@ class BeliefFilter:
         self.goals: dict[str, tuple[Likeness, Percept]] = {}
         self.instances: dict[str, list[Instance]] = {}
         self.born = dict.fromkeys(self.names, 1)  # how many of each kind were found so far
+        self.several: set[str] = set()  # kinds of which there were surely two
         return ()
 
     def _rng(self, step: int, what: str) -> np.random.Generator:
@@ -115,28 +118,40 @@ class BeliefFilter:
         rngs = {instance.number: self._rng(step, instance.label) for instance in instances}
         for instance in instances:
             instance.carry(step, rngs[instance.number])
-        several = self.born[name] > 1 or len(seen[name]) > 1
+        several = name in self.several or len(instances) > 1 or len(seen[name]) > 1
         numbers = self._assigned(name, seen) if several else [0 if seen[name] else None]
         unseen = replace(percept, presence=0.0, goal_agreement=None, further=[]) if several else percept
         told: dict[int, Belief] = {}
         for instance, number in zip(instances, numbers, strict=True):
             mine = unseen if number is None else seen[name][number]
-            told[instance.number] = self._take(instance, mine, number is not None, seen, rngs[instance.number], changes)
+            told[instance.number], change = self._take(instance, mine, number is not None, seen,
+                                                       rngs[instance.number], alone=not several)
+            changes += [] if change is None else [(instance, change)]
+        if not several and instances[0].left is not None:
+            self._leave(name, instances[0].left, step)
         if several:
-            left = [p for k, p in enumerate(seen[name]) if k not in numbers]
-            told |= {instance.number: self._take(instance, mine, True, seen, rng, changes)
-                     for instance, mine, rng in self._births(name, left, seen)}
-            self._bury(name, changes)
-        return [told[instance.number] for instance in self.instances[name]]
+            rest = [p for k, p in enumerate(seen[name]) if k not in numbers]
+            for instance, mine, rng in self._births(name, rest, seen):
+                told[instance.number], _ = self._take(instance, mine, True, seen, rng, alone=False)
+            self._bury(name)
+            if sum(i.position.presence > SURE for i in self.instances[name]) > 1:
+                self.several.add(name)
+        return [told[i.number] for i in self.instances[name] if i.number in told]
 
     def _take(self, instance: Instance, percept: Percept, is_seen: bool, seen: dict[str, list[Percept]],
-              rng: np.random.Generator, changes: list[tuple[Instance, Change]]) -> Belief:
-        """Updates one instance, and notes what happened to it."""
+              rng: np.random.Generator, *, alone: bool) -> tuple[Belief, Change | None]:
+        """Updates one instance. Returns what is believed about it, and what happened to it."""
         single = replace(percept, further=[]) if percept.further else percept
-        belief, change = instance.update(single, is_seen, self._others(instance.kind.name, percept, seen), rng)
-        if change is not None:
-            changes.append((instance, change))
-        return belief
+        return instance.update(single, is_seen, self._others(instance.kind.name, percept, seen), rng, alone=alone)
+
+    def _leave(self, name: str, place: Moments, step: int) -> None:
+        """One of a kind was seen elsewhere, and nobody has looked where it was: perhaps there are two."""
+        self.born[name] += 1
+        rng = self._rng(step, f"{name}#{self.born[name]}")
+        instance = self._instance(name, self.born[name], rng)
+        instance.position.placed(*place, rng)
+        instance.position.log_odds = LEFT_LOG_ODDS
+        self.instances[name].append(instance)
 
     def _others(self, name: str, percept: Percept, seen: dict[str, list[Percept]]) -> Others:
         """What else is seen beside a percept of a kind: it may hide what is behind it."""
@@ -167,12 +182,10 @@ class BeliefFilter:
             instances.append(instance)
             yield instance, percept, rng
 
-    def _bury(self, name: str, changes: list[tuple[Instance, Change]]) -> None:
+    def _bury(self, name: str) -> None:
         """Drops the instances that are not there any more, and those that are another one once more. One is left."""
         instances = self.instances[name]
-        gone = {instance.number for instance, change in changes if change.kind == "gone"
-                and instance.kind.name == name}
-        alive = [i for i in instances if i.number not in gone and i.position.log_odds > DEAD_LOG_ODDS
+        alive = [i for i in instances if i.position.log_odds > DEAD_LOG_ODDS
                  and np.trace(i.position.moments()[1]) < LOST_M ** 2]
         places, presences = [i.position.moments() for i in alive], [i.position.presence for i in alive]
         twice = doubles(places, presences, SAME * self.radius_m[name])

@@ -51,6 +51,8 @@ class Instance:
         self.since = 0
         self.last_seen: Percept | None = None
         self.was_seen = False  # in the last image
+        # Where it was before this image, if it is seen elsewhere and that place is not in view: it may be there, too
+        self.left: Moments | None = None
 
     @property
     def label(self) -> str:
@@ -66,10 +68,11 @@ class Instance:
         if self.goal_view is not None:
             self.goal_view.carried(velocity_m, step)
 
-    def update(self, percept: Percept, seen: bool, others: Others,
-               rng: np.random.Generator) -> tuple[Belief, Change | None]:
+    def update(self, percept: Percept, seen: bool, others: Others, rng: np.random.Generator, *,
+               alone: bool = True) -> tuple[Belief, Change | None]:
         """Takes one image, in which it is `seen` by a percept or not. A percept that does not see it tells of the
-        camera. Returns what is believed, and what is noticed to have happened."""
+        camera. Returns what is believed, and what is noticed to have happened. Of one that is not `alone` of its kind
+        nothing is noticed: what is elsewhere is another one."""
         position = self.position
         visible = position.visible(percept.world_from_camera, percept.intrinsics_px, others)
         before, prior = position.moments(), position.expected(visible)
@@ -77,7 +80,11 @@ class Instance:
             position.seen(percept, rng)
         else:
             position.missed(visible, rng)
-        change = self._notice(percept, seen, others, rng)
+        self.left, change = None, None
+        if alone:
+            change = self._notice(percept, seen, others, rng)
+        else:
+            self.motion = Motion()
         mean, covariance = position.moments()
         posterior, goal_range_m, goal_here = None, 0.0, 0.0
         if self.goal_view is not None:
@@ -102,7 +109,7 @@ class Instance:
 
     def _notice(self, percept: Percept, seen: bool, others: Others, rng: np.random.Generator) -> Change | None:
         """What is noticed to have happened. The belief then begins anew where it has to."""
-        motion, position = self.motion, self.position
+        motion, position, anchor = self.motion, self.position, self.motion.anchor
         clear = position.clear(motion.places, percept.world_from_camera, percept.intrinsics_px, others)
         evidence = of_whole(percept, self.kind.radius_m, others) if seen else None
         change = motion.step(percept.step, evidence, percept.presence, clear)
@@ -113,6 +120,9 @@ class Instance:
         elif change.kind != "rests":
             position.placed(change.place, change.covariance, rng)
             self.since = percept.step
+        if change.kind == "moved" and anchor is not None and not position.clear(
+                anchor.place[None], percept.world_from_camera, percept.intrinsics_px, others)[0]:
+            self.left = anchor.place, anchor.covariance[:3, :3]
         if change.kind == "moved" and self.goal_view is not None:
             self.goal_view.forget()
         return change

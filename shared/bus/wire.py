@@ -69,22 +69,21 @@ def _unpack_array(code: int, data: bytes) -> np.ndarray:
 def encode(message: Message) -> bytes:
     """Returns the bytes of a message. Raises MessageError if the message is not valid, so that no service can publish
     what another one must refuse."""
-    payload = msgpack.packb(_map_of(message), default=packed_array)
+    payload = msgpack.packb(_map_of(type(message), message), default=packed_array)
     _check_size(type(message), payload)
     return payload
 
 
-def _map_of(message: Message) -> dict[str, Any]:
+def _map_of(message_type: type[Message], message: Message) -> dict[str, Any]:
     """The checked fields of a message, and of the messages that it lists."""
     fields = {f.name: getattr(message, f.name) for f in dataclasses.fields(message)}
-    _check(type(message), fields)
-    message_type: type[Message] = type(message)
+    _check(message_type, fields)
     for name, item_type in _lists(message_type).items():
         if any(type(item) is not item_type or any(getattr(item, n) for n in _lists(item_type))
                for item in fields[name]):
             raise MessageError(f"{name}: not messages of the type {item_type.__name__} that list no others")
-        fields[name] = [_map_of(item) for item in fields[name]]
-    return {"type": type(message).__name__, "version": message.VERSION, **fields}
+        fields[name] = [_map_of(item_type, item) for item in fields[name]]
+    return {"type": message_type.__name__, "version": message.VERSION, **fields}
 
 
 @functools.cache
