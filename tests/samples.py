@@ -16,7 +16,9 @@ VALUES = {str: "mug", int: 3, float: 0.5, bool: True, list[str]: ["mug", "can"]}
 
 def sample(message_type: type[Message], **changes: Any) -> Message:
     """Every field filled, also the optional ones. It is of the first of its kind."""
-    filled = {name: 1 if name == "instance" else _value(hint) for name, hint in field_types(message_type).items()}
+    filled: dict[str, Any] = {name: _value(hint) for name, hint in field_types(message_type).items()}
+    if "instance" in filled:
+        filled["instance"] = 1
     return message_type(**filled | changes)
 
 

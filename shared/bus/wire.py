@@ -79,7 +79,7 @@ def _map_of(message_type: type[Message], message: Message) -> dict[str, Any]:
     fields = {f.name: getattr(message, f.name) for f in dataclasses.fields(message)}
     _check(message_type, fields)
     for name, item_type in _lists(message_type).items():
-        if any(type(item) is not item_type or any(getattr(item, n) for n in _lists(item_type))
+        if any(not isinstance(item, item_type) or any(getattr(item, n) for n in _lists(item_type))
                for item in fields[name]):
             raise MessageError(f"{name}: not messages of the type {item_type.__name__} that list no others")
         fields[name] = [_map_of(item_type, item) for item in fields[name]]
