@@ -20,7 +20,8 @@ Moments = tuple[Array, Array]  # mean [3], covariance [3, 3]
 
 LOG_BIRTH = float(np.log(0.01 / 0.5))  # chosen: log density of a new instance, per cubic metre of the workspace
 BIRTH_LOG_ODDS = 2.0  # chosen: by so much more than its percept's an instance's log odds are lower when it is born
-LEFT_LOG_ODDS = -0.5  # chosen: log odds that one is where another one was seen before, while nobody looks there
+LEFT_LOG_ODDS = 0.4  # chosen: log odds that one is where another one was seen before, while nobody looks there
+MORE_LOG_ODDS = -0.85  # chosen: log odds that there is one more of several, before anybody has looked for it
 SURE = 0.9  # chosen: presence from which on an instance is surely one of several
 APART = 0.9  # chosen: an instance is born only if it is farther than so many of its radii from all others
 VAGUE_M = 0.12  # chosen: no instance is born from a percept with a larger deviation

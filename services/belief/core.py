@@ -14,6 +14,7 @@ from saccade.services.belief.association import (
     DEAD_LOG_ODDS,
     LEFT_LOG_ODDS,
     LOST_M,
+    MORE_LOG_ODDS,
     MOST,
     SAME,
     SURE,
@@ -68,7 +69,7 @@ class BeliefFilter:
         self.goals: dict[str, tuple[Likeness, Percept]] = {}
         self.instances: dict[str, list[Instance]] = {}
         self.born = dict.fromkeys(self.names, 1)  # how many of each kind were found so far
-        self.several: set[str] = set()  # kinds of which there were surely two
+        self.more: dict[str, Instance] = {}  # of kinds of which there were surely two: one more that was not seen yet
         return ()
 
     def _rng(self, step: int, what: str) -> np.random.Generator:
@@ -118,7 +119,7 @@ class BeliefFilter:
         rngs = {instance.number: self._rng(step, instance.label) for instance in instances}
         for instance in instances:
             instance.carry(step, rngs[instance.number])
-        several = name in self.several or len(instances) > 1 or len(seen[name]) > 1
+        several = name in self.more or len(instances) > 1 or len(seen[name]) > 1
         numbers = self._assigned(name, seen) if several else [0 if seen[name] else None]
         unseen = replace(percept, presence=0.0, goal_agreement=None, further=[]) if several else percept
         told: dict[int, Belief] = {}
@@ -134,9 +135,19 @@ class BeliefFilter:
             for instance, mine, rng in self._births(name, rest, seen):
                 told[instance.number], _ = self._take(instance, mine, True, seen, rng, alone=False)
             self._bury(name)
-            if sum(i.position.presence > SURE for i in self.instances[name]) > 1:
-                self.several.add(name)
-        return [told[i.number] for i in self.instances[name] if i.number in told]
+        return [told[i.number] for i in self.instances[name] if i.number in told] + self._one_more(name, unseen, seen)
+
+    def _one_more(self, name: str, unseen: Percept, seen: dict[str, list[Percept]]) -> list[Belief]:
+        """Where there are several there may be one more, where nobody has looked yet."""
+        if sum(i.position.presence > SURE for i in self.instances[name]) < 2 and name not in self.more:
+            return []
+        number = self.born[name] + 1
+        rng = self._rng(unseen.step, f"{name}#{number} unseen")
+        if name not in self.more:
+            self.more[name] = self._instance(name, number, rng)
+            self.more[name].position.log_odds = MORE_LOG_ODDS
+        self.more[name].number = number
+        return [self._take(self.more[name], unseen, False, seen, rng, alone=False)[0]]
 
     def _take(self, instance: Instance, percept: Percept, is_seen: bool, seen: dict[str, list[Percept]],
               rng: np.random.Generator, *, alone: bool) -> tuple[Belief, Change | None]:

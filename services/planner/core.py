@@ -125,7 +125,7 @@ class Planner:
             return flat(told, None, 1)
         target, each, scores = self.preference.target, told[self.preference.target].each(), {}
         if [belief.instance for belief in each] == [self.target_instance]:
-            return flat(told, None, 1)
+            return flat(told, target, self.target_instance)
         for belief in each:
             beliefs = flat(told, target, belief.instance)
             ground = self._ground(beliefs)

@@ -31,20 +31,24 @@ class Tried:
 
 def flat(beliefs: Mapping[str, Belief], target: str | None, number: int) -> dict[str, Belief]:
     """One belief under each name, and the further ones of each kind under their labels. Under the target's name it is
-    the one of this number, if there is one."""
+    the one of this number, if there is one. Who has a target does not look for further ones that were not found."""
     result = dict(beliefs)
     for name, belief in beliefs.items():
         each = belief.each()
         first = next((b for b in each if name == target and b.instance == number), belief)
         result[name] = first
-        result |= {f"{name}#{b.instance}": b for b in each if b is not first}
+        result |= {f"{name}#{b.instance}": b for b in each if b is not first and (target is None or _is_found(b))}
     return result
+
+
+def _is_found(belief: Belief) -> bool:
+    return bool(np.trace(belief.covariance_m2) < FOUND_M ** 2)
 
 
 def score(belief: Belief, eye: Array | None, camera: Array, tried: Tried | None, *, is_blocked: bool) -> float:
     """How good it is to go for an instance, in nats: that it is there, how sure it is from where it looks like the goal
     image, and how near the view is, at the position `eye` [3] if it is known, to a camera [4, 4]."""
-    if np.trace(belief.covariance_m2) > FOUND_M ** 2 or eye is None or belief.goal_log_posterior is None:
+    if not _is_found(belief) or eye is None or belief.goal_log_posterior is None:
         return -np.inf
     sure = float(belief.goal_log_posterior.max())
     way_m = float(np.linalg.norm(eye - camera[:3, 3]))
