@@ -207,7 +207,8 @@ class Belief(Message):
     instance: int = 1
     """Its number among those of its kind that were found in this episode, from 1. It stays the same."""
     further: list[Belief] = field(default_factory=list)
-    """The others of its kind, by their numbers. These have no further ones."""
+    """The others of its kind. Where there are several, the last one is one that was not seen yet and may be where
+    nobody has looked. These have no further ones."""
     count_probabilities: Annotated[np.ndarray, array("f8", "C")] | None = None
     """Probabilities that none, one, two and so on of its kind are in the scene. Absent in `further`."""
 
