@@ -10,9 +10,10 @@ from pathlib import Path
 
 from saccade.shared.config import PACKAGE, BeliefConfig, PlannerConfig, Section
 
-MODULES = ("services.belief.core", "services.belief.motion", "services.belief.pose", "services.belief.position",
-           "services.belief.attitude", "services.planner.core", "services.planner.candidates", "services.planner.place",
-           "services.planner.free_energy", "services.planner.moving")
+MODULES = ("services.belief.core", "services.belief.instance", "services.belief.association",
+           "services.belief.motion", "services.belief.pose", "services.belief.position", "services.belief.attitude",
+           "services.planner.core", "services.planner.candidates", "services.planner.place",
+           "services.planner.free_energy", "services.planner.moving", "services.planner.instances")
 SECTIONS: dict[str, type[Section]] = {"belief": BeliefConfig, "planner": PlannerConfig}
 KINDS = ("chosen", "derived", "measured", "from the")  # a constant's comment begins with one of these
 # These are not listed: one is a number of the paper, the other is for the viewer only

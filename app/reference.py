@@ -22,7 +22,7 @@ from typer.main import get_command
 
 from saccade.app.constants import constants as all_constants
 from saccade.app.run.registry import AGENTS, WORLDS, service_of
-from saccade.shared.bus.messages import ArraySpec, Message, field_types
+from saccade.shared.bus.messages import ArraySpec, Message, field_types, items_of
 from saccade.shared.bus.topics import TOPICS, Topic
 from saccade.shared.config import PACKAGE, Config
 
@@ -93,6 +93,8 @@ def _kind(kind: Any) -> str:
     if get_origin(kind) is Annotated:
         spec: ArraySpec = get_args(kind)[1]
         return f"array {spec.dtype} [{', '.join(str(n) for n in spec.shape)}]"
+    if (item_type := items_of(kind)) is not None:
+        return f"list of maps as [{item_type.__name__}](#{item_type.__name__.lower()})"
     return {str: "text", int: "integer", float: "number", bool: "true or false"}.get(kind, "list of texts")
 
 

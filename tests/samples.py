@@ -7,16 +7,19 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from saccade.shared.bus.messages import Message, Percept, field_types
+from saccade.shared.bus.messages import Message, Percept, field_types, items_of
 from saccade.shared.world.geometry import INTRINSICS_PX
 
-DIMENSIONS = {"H": 4, "W": 5, "L": 8, "N": 3, "E": 6, "A": 7, "M": 10, "B": 2, "R": 4, "G": 2}
+DIMENSIONS = {"H": 4, "W": 5, "L": 8, "N": 3, "E": 6, "A": 7, "M": 10, "B": 2, "R": 4, "G": 2, "C": 3}
 VALUES = {str: "mug", int: 3, float: 0.5, bool: True, list[str]: ["mug", "can"]}
 
 
 def sample(message_type: type[Message], **changes: Any) -> Message:
-    """Every field filled, also the optional ones."""
-    return message_type(**{name: _value(hint) for name, hint in field_types(message_type).items()} | changes)
+    """Every field filled, also the optional ones. It is of the first of its kind."""
+    filled: dict[str, Any] = {name: _value(hint) for name, hint in field_types(message_type).items()}
+    if "instance" in filled:
+        filled["instance"] = 1
+    return message_type(**filled | changes)
 
 
 def goal_percept(name: str) -> Percept:
@@ -37,6 +40,8 @@ def _value(hint: Any) -> Any:
         spec = typing.get_args(hint)[1]
         shape = [DIMENSIONS.get(n, n) for n in spec.shape]
         return (np.arange(np.prod(shape)) % 200).reshape(shape).astype(spec.dtype)
+    if items_of(hint) is not None:
+        return []
     if hint in VALUES:
         return VALUES[hint]
     return _value(next(h for h in typing.get_args(hint) if h is not type(None)))

@@ -14,6 +14,7 @@ from rich.console import Console
 
 import saccade.app.bench.bench as bench_module
 from saccade.app.bench.bench import Plan, bench, prepare, run_scene, spread
+from saccade.app.bench.counting import Counted
 from saccade.app.bench.suites import suite_file
 from saccade.app.bench.table import PAPER, TOTAL, mean, milliseconds, render, rows, wilson
 from saccade.app.run.launch import PROCESSES
@@ -251,7 +252,9 @@ def test_a_scene_is_the_same_alone_as_in_a_run_of_the_whole_file(tmp_path):
     run_local(local_pairs("sceneccn", plan.config), names, "bench", range(2), hear)
     alone = run_scene("sceneccn", plan.config.model_dump_json(), 1)
     whole = {key: getattr(results[1], key) for key in bench_module.RECORD_KEYS}
-    assert timeless([alone]) == [whole | {"changes": 0, "noticed": 0, "false_events": 0}]
+    counted = {key: alone[key] for key in Counted._fields}
+    assert timeless([alone]) == [whole | {"changes": 0, "noticed": 0, "false_events": 0} | counted]
+    assert counted["instances"] == 1
     assert actions[0] != actions[1]
 
 

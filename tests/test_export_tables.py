@@ -16,7 +16,7 @@ from rich.console import Console
 
 from saccade.app.log import tables
 from saccade.app.log.export import export_foxglove, export_tables
-from saccade.app.log.fields import kinds
+from saccade.app.log.fields import kinds, value_of
 from saccade.shared.bus.messages import ArraySpec, field_types
 from saccade.shared.bus.topics import FRAME, PLAN, TOPICS
 from saccade.shared.bus.wire import encode
@@ -51,7 +51,7 @@ def test_a_table_has_a_typed_column_for_every_field(tmp_path, topic):
     types = {int: pa.int64(), float: pa.float64(), bool: pa.bool_(), str: pa.string(), list[str]: pa.list_(pa.string())}
     columns = set(table.column_names) - {"log_time", "part"}
     for name, kind in kinds(topic.type).items():
-        value = getattr(message, name)
+        value = value_of(message, name)
         if not isinstance(kind, ArraySpec):
             assert table.schema.field(name).type == types[kind]
             assert table.column(name).to_pylist() == [value] * 3

@@ -8,7 +8,7 @@ import msgpack
 import numpy as np
 import pytest
 
-from saccade.shared.bus.messages import Action, Frame, Goal, Message, field_types
+from saccade.shared.bus.messages import Action, Frame, Goal, Message, Percept, field_types
 from saccade.shared.bus.topics import TOPICS
 from saccade.shared.bus.wire import (
     ARRAY_EXTENSION,
@@ -17,11 +17,12 @@ from saccade.shared.bus.wire import (
     MAX_SMALL_BYTES,
     MAX_TEXT,
     MessageError,
-    _pack_array,
     decode,
     encode,
+    packed_array,
     stamp_of,
 )
+from saccade.shared.loop.stepper import settle
 from saccade.tests.samples import array_fields, sample
 
 TYPES = sorted({topic.type for topic in TOPICS.values()}, key=lambda t: t.__name__)
@@ -47,7 +48,7 @@ def wire(message: Message, **changes) -> bytes:
     """The message's map with some entries replaced (None of them checked) or, where the value is `...`, left out."""
     fields = {"type": type(message).__name__, "version": message.VERSION}
     fields |= {f.name: getattr(message, f.name) for f in dataclasses.fields(message)} | changes
-    return msgpack.packb({k: v for k, v in fields.items() if v is not ...}, default=_pack_array)
+    return msgpack.packb({k: v for k, v in fields.items() if v is not ...}, default=packed_array)
 
 
 @every_type
@@ -167,3 +168,38 @@ def test_the_stamp_is_that_of_the_whole_message(topic):
 def test_what_does_not_begin_with_a_stamp_is_refused(payload):
     with pytest.raises(MessageError, match="stamp"):
         stamp_of(payload)
+
+
+# --- messages that list others
+
+def test_further_ones_of_a_kind_travel_with_the_first():
+    """Their arrays come back as they were, aligned and read-only as those of the first once a service takes them."""
+    second = sample(Percept, object="mug", presence=0.25)
+    back = decode(Percept, encode(sample(Percept, object="mug", further=[second])))
+    assert [each.presence for each in back.each()] == [0.5, 0.25]
+    np.testing.assert_array_equal(back.further[0].rotations, second.rotations)
+    inner = settle(back).further[0].pixel
+    assert inner.flags.aligned
+    assert not inner.flags.writeable
+
+
+@pytest.mark.parametrize(("further", "complaint"), [
+    ([sample(Percept, further=[sample(Percept)])], "further: not messages of the type Percept that list no others"),
+    ([sample(Action)], "further: not messages of the type Percept"),
+    ("mug", "further: not a list"), ([3], "further: not a list"),
+    ([sample(Percept)] * 33, "further: not a list of at")])
+def test_what_is_listed_is_checked_before_it_is_said(further, complaint):
+    with pytest.raises(MessageError, match=complaint):
+        encode(sample(Percept, further=further))
+
+
+@pytest.mark.parametrize(("change", "complaint"), [
+    ({"presence": float("nan")}, "presence: not a finite number"), ({"type": "Belief"}, "type: not a Percept"),
+    ({"version": 1}, "version: 1, not"), ({"odd": 1}, "odd: unknown field"),
+    ({"further": [{"a": 1}]}, "further: a list")])
+def test_what_is_listed_is_checked_when_it_is_heard(change, complaint):
+    """A map in a list is as little trusted as the one around it, and holds no lists of maps itself."""
+    fields = msgpack.unpackb(encode(sample(Percept, further=[sample(Percept)])))
+    fields["further"][0] |= change
+    with pytest.raises(MessageError, match=complaint):
+        decode(Percept, msgpack.packb(fields))

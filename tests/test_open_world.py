@@ -10,6 +10,7 @@ import torch.nn.functional as F
 from saccade.services.perception.comparer import Compared, Comparison
 from saccade.services.perception.likeness import UNIT, Cohort
 from saccade.services.perception.local_features import LocalFeatures
+from saccade.services.perception.matching import best_matches, further_matches, unclaimed
 from saccade.services.perception.open_world import Match, OpenWorld, Placed, Things, rolled
 from saccade.services.perception.proposer import STRIDE, Proposer, places, propose
 from saccade.services.perception.view_encoder import VECTOR, ViewEncoder
@@ -155,14 +156,24 @@ def test_any_size_is_seen_and_an_empty_picture_shows_nothing(bank, shape):
     assert seen.latent_mean.shape == (2, 0)
 
 
-def test_a_thing_is_one_object_or_none(bank):
+def test_a_thing_is_one_object_or_none():
     """The probabilities of all objects in one thing sum to less than 1."""
-    torch.manual_seed(2)
-    model = OpenWorld(Proposer(), ViewEncoder(), Comparison(), LocalFeatures(), [bank, bank, bank], STRANGERS)
-    matches = model._matches([(k, 0, 0) for k in range(3)], np.array([3.0, 2.0, -4.0]), {})
+    matches = best_matches(3, [(k, 0, 0) for k in range(3)], np.array([3.0, 2.0, -4.0]), {})
     presence = [match.presence for match in matches]
     assert sum(presence) < 1.0
     assert presence[0] == pytest.approx(np.exp(3) / (1 + np.exp(3) + np.exp(2) + np.exp(-4)))
+
+
+def test_one_more_of_an_object_is_what_is_as_like_it_and_no_other_object():
+    """Things 0 and 2 are alike and like object 0, thing 1 is object 1, thing 3 is like nothing, and the last thing is
+    the whole image: only thing 2 may be one more, and it is if the odds say so."""
+    similar = [torch.tensor([[0.9], [0.1], [0.85], [0.2], [0.9]]), torch.tensor([[0.1], [0.8], [0.2], [0.2], [0.5]])]
+    matches = [Match(0, 0.99, 0, 0, None), Match(1, 0.98, 0, 0, None)]
+    assert unclaimed(similar, matches, whole=True) == [(0, 2)]
+    assert [(k, match.thing) for k, match in further_matches([(0, 2, 0)], np.array([9.0]), {})] == [(0, 2)]
+    assert further_matches([(0, 2, 0)], np.array([0.9]), {}) == []
+    absent = [Match(0, 0.2, 0, 0, None), Match(1, 0.98, 0, 0, None)]
+    assert unclaimed(similar, absent, whole=True) == []
 
 
 def test_a_similarity_counts_by_what_is_usual_for_the_crop_and_for_the_view():

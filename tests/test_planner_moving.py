@@ -63,10 +63,10 @@ def test_when_the_target_was_moved_the_plan_is_made_anew_and_what_was_tried_is_f
     made, moved_to = planner(), CENTER + np.array([-0.2, 0.1, 0.0])
     first = plan_of(made, belief(0, SIDE))
     plan_of(made, belief(1, first.viewpoint, here=0.01))  # it has arrived, and the view is not the goal's
-    assert len(made.visited) == 1
+    assert len(made.now.visited) == 1
     unmoved = plan_of(made, belief(2, SIDE, center=moved_to))
     moved = plan_of(made, belief(3, SIDE, center=moved_to, since_step=3))
-    assert made.visited == []
+    assert made.now.visited == []
     wanted = moved_to + 0.4 * direction(0.0, 0.5)
     assert np.linalg.norm(moved.viewpoint[:3, 3] - wanted) < 0.05 < np.linalg.norm(unmoved.viewpoint[:3, 3] - wanted)
 

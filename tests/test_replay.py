@@ -18,7 +18,19 @@ from saccade.app.replay.replay import REPLAYABLE
 from saccade.app.replay.tolerances import TOLERANCES, tolerance_of
 from saccade.app.run.run import run
 from saccade.shared.bus.messages import field_types
-from saccade.shared.bus.topics import ACTION, BELIEF, EVENTS, FRAME, GOAL, GOAL_PERCEPT, PERCEPT, STATUS, TOPICS, TRUTH
+from saccade.shared.bus.topics import (
+    ACTION,
+    BELIEF,
+    EVENTS,
+    FRAME,
+    GOAL,
+    GOAL_PERCEPT,
+    PERCEPT,
+    PLAN,
+    STATUS,
+    TOPICS,
+    TRUTH,
+)
 from saccade.shared.bus.wire import encode
 from saccade.shared.log.migrations import FORMAT, OLDEST
 from saccade.shared.log.reading import RunReader
@@ -26,8 +38,8 @@ from saccade.shared.log.recording import RunLog
 from saccade.tests.fixtures.make import CONFIG, GOLDEN, IN_WORDS, WORDS, changes, in_words
 from saccade.tests.samples import sample
 
-FORMAT_1, FORMAT_2, FORMAT_3, FORMAT_4, FORMAT_5, FORMAT_6 = OLDER = tuple(
-    GOLDEN.with_name(f"format_{number}.mcap") for number in (1, 2, 3, 4, 5, 6))
+FORMAT_1, FORMAT_2, FORMAT_3, FORMAT_4, FORMAT_5, FORMAT_6, FORMAT_7 = OLDER = tuple(
+    GOLDEN.with_name(f"format_{number}.mcap") for number in (1, 2, 3, 4, 5, 6, 7))
 WAIT_S = 300
 
 
@@ -107,6 +119,16 @@ def test_a_log_without_motion_tells_objects_that_rest():
 def test_a_belief_without_rolled_goals_is_one_of_an_upright_world():
     """Format 6: beliefs lacked them."""
     assert {b.goal_rotations is None for t, _, b in RunReader(FORMAT_6) if t == BELIEF} == {True}
+
+
+def test_a_log_without_instances_tells_of_the_first_of_each_kind():
+    """Format 7: percepts and beliefs had no further ones of a kind, plans and events no numbers. All else that the
+    agent says is as it was."""
+    said = [m for t, _, m in RunReader(FORMAT_7) if t in (PERCEPT, BELIEF, PLAN)]
+    assert {m.further == [] for m in said if hasattr(m, "further")} == {True}
+    assert {m.instance for m in said if hasattr(m, "instance")} == {1}
+    assert {m.target_instance for m in said if hasattr(m, "target_instance")} == {1}
+    assert not changes(FORMAT_7, GOLDEN)
 
 
 def test_on_the_bus_as_in_one_process_nothing_is_lost(tmp_path):

@@ -260,9 +260,10 @@ def test_decisions_in_words(changes, presence, words):
 def test_events_in_words_and_as_marks(tmp_path):
     """Each event is one line among the decisions, and a mark with its name in the world."""
     events = sample(EVENTS.type, run="r", episode=0, step=3, objects=["005_tomato_soup_can", "mug"],
-                    kinds=["moved", "gone"], positions_m=np.array([[0.1, 0.2, 0.05], [0.0, 0.0, 0.1]]),
+                    instances=np.array([2, 1], np.uint8), kinds=["moved", "gone"],
+                    positions_m=np.array([[0.1, 0.2, 0.05], [0.0, 0.0, 0.1]]),
                     probabilities=np.array([0.97, 1.0]))
-    said = ["the tomato soup can was moved (97 %)", "the mug is gone (100 %)"]
+    said = ["the tomato soup can#2 was moved (97 %)", "the mug is gone (100 %)"]
     assert happened(events) == said
     recording = rr.RecordingStream("saccade")
     recording.save(tmp_path / "run.rrd")

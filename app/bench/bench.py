@@ -21,6 +21,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from saccade.app.bench import table
+from saccade.app.bench.counting import counted
 from saccade.app.bench.noticing import noticed
 from saccade.app.bench.suites import default_suite, suite_file
 from saccade.app.bench.workers import in_processes
@@ -29,7 +30,7 @@ from saccade.app.run.display import say
 from saccade.app.run.registry import Pair, local_pairs, weight_hashes
 from saccade.services.simulator.scenes import Scene, load_scenes
 from saccade.services.simulator.suites import SUITES
-from saccade.shared.bus.messages import Events, Message, Result, Truth
+from saccade.shared.bus.messages import Belief, Events, Message, Result, Truth
 from saccade.shared.bus.topics import Topic
 from saccade.shared.config import Config, merged
 from saccade.shared.errors import SaccadeError
@@ -266,14 +267,18 @@ def cores(agent: str, config_text: str) -> tuple[Config, list[Pair]]:
 
 def run_scene(agent: str, config_text: str, number: int) -> dict[str, Any]:
     """Runs one scene within this process as episode `number`, and returns its record with what the agent noticed of
-    the events, the seconds of the scene and the mean milliseconds per step of each service."""
+    the events, how many of a kind it has found, the seconds of the scene and the mean milliseconds per step of each
+    service."""
     config, pairs = cores(agent, config_text)
     heard: dict[type[Message], list[Any]] = {Result: [], Truth: [], Events: []}
+    beliefs: dict[str, Belief] = {}
     spent_ms: dict[str, list[float]] = {service.name: [] for service, _ in pairs}
     start = time.perf_counter()
 
     def hear(_topic: Topic, _part: str | None, message: Message, _payload: bytes | None) -> None:
-        if type(message) in heard:
+        if isinstance(message, Belief):
+            beliefs[message.object] = message
+        elif type(message) in heard:
             heard[type(message)].append(message)
 
     run_local(pairs, config.names, RUN, (number,), hear,
@@ -281,6 +286,9 @@ def run_scene(agent: str, config_text: str, number: int) -> dict[str, Any]:
     seconds = round(time.perf_counter() - start, 3)
     means = {service: round(fmean(values), 3) for service, values in spent_ms.items() if values}
     told = noticed(heard[Truth], heard[Events])._asdict() if heard[Events] else {}  # not every agent tells events
+    if beliefs and heard[Truth]:
+        at = next(truth for truth in heard[Truth] if truth.step == next(iter(beliefs.values())).step)
+        told |= counted(at, beliefs)._asdict()
     return record_of(heard[Result][0]) | told | {"seconds": seconds, "milliseconds": means}
 
 

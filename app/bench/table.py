@@ -135,6 +135,17 @@ def noticed_words(records: Sequence[Record]) -> str:
     return text
 
 
+def counted_words(records: Sequence[Record]) -> str:
+    """How often the agent knew how many there are, in one line. It is empty where nothing is there twice."""
+    told = [r for r in records if r.get("instances", 0) > 1]
+    if not told:
+        return ""
+    right = wilson(sum(r["counted"] == r["instances"] for r in told), len(told))
+    kinds = wilson(sum(r["kinds_counted"] for r in told), sum(r["kinds"] for r in told))
+    return (f"number of the target's kind right at the end: {_percent(right)} of {len(told)} scenes; of any kind: "
+            f"{_percent(kinds)} of {sum(r['kinds'] for r in told)}")
+
+
 def _percent(share: Estimate) -> str:
     return f"{100 * share.value:.1f} % ({100 * share.low:.1f} to {100 * share.high:.1f})"
 
@@ -157,6 +168,8 @@ def render(records: Sequence[Record], *, title: str) -> Table:
         caption += "\nmilliseconds per step: " + ", ".join(f"{name} {ms:.1f}" for name, ms in spent.items())
     if events := noticed_words(records):
         caption += f"\nevents {events}"
+    if counts := counted_words(records):
+        caption += f"\n{counts}"
     table = Table(title=Text(printable(title), style="table.title"), caption=caption, show_lines=True)
     for header in ("target", "", "n"):
         table.add_column(header)

@@ -125,10 +125,16 @@ class Scene:
                              scale_invariant=True, color=colour(PATH))])
 
     def _belief(self, belief: Belief, at: fm.Timestamp) -> Iterator[Told]:
+        """All instances of an object, on topics of their own."""
+        for each in belief.each():
+            yield from self._instance(each, at)
+
+    def _instance(self, belief: Belief, at: fm.Timestamp) -> Iterator[Told]:
+        name = belief.label().replace("#", "/")
         rgb = self._colour(belief.object)
-        yield f"/belief/{belief.object}/particles", cloud(belief.particles_m, rgb, belief.presence, at)
-        text = f"{belief.object} {belief.presence:.0%}"
-        yield f"/belief/{belief.object}/spread", update(belief.object, at, spheres=[ellipsoid(belief, rgb)],
+        yield f"/belief/{name}/particles", cloud(belief.particles_m, rgb, belief.presence, at)
+        text = f"{belief.label()} {belief.presence:.0%}"
+        yield f"/belief/{name}/spread", update(belief.label(), at, spheres=[ellipsoid(belief, rgb)],
                                                         texts=[label(text, belief.mean_m, rgb)])
 
     def _colour(self, name: str) -> tuple[float, float, float]:

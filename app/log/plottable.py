@@ -18,7 +18,7 @@ from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorP
 from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
 
-from saccade.app.log.fields import IMAGE, fixed_numbers, kinds
+from saccade.app.log.fields import IMAGE, fixed_numbers, kinds, value_of
 from saccade.app.run.display import Progress, spread_cm
 from saccade.shared.bus.messages import ArraySpec, Belief, Message, Plan, Truth
 
@@ -57,7 +57,7 @@ class Values:
             if (derive := DERIVED.get(self._type, {}).get(name)) is not None:
                 value = derive(message, progress)
                 self._values[name] = math.nan if value is None else value
-            elif (value := getattr(message, name)) is not None:
+            elif (value := value_of(message, name)) is not None:
                 self._values[name] = value.ravel().tolist() if isinstance(value, np.ndarray) else value
 
     def get_schema(self) -> Schema:

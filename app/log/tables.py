@@ -17,8 +17,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from saccade.app.log.fields import IMAGE, fixed_numbers, kinds
-from saccade.shared.bus.messages import ArraySpec, Message
+from saccade.app.log.fields import IMAGE, fixed_numbers, kinds, value_of
+from saccade.shared.bus.messages import ArraySpec, Belief, Message, Percept
 from saccade.shared.bus.topics import Topic
 from saccade.shared.log.reading import Recorded
 
@@ -47,9 +47,10 @@ class Table:
         self._rows: list[list[Any]] = []
 
     def add(self, entry: Recorded, message: Message) -> None:
-        """Appends one row."""
-        self._rows.append([column.value(entry, message) for column in self._columns])
-        if len(self._rows) == ROW_GROUP:
+        """Appends one row, and one for each further message of several of a kind."""
+        each = message.each() if isinstance(message, Belief | Percept) else [message]
+        self._rows += [[column.value(entry, one) for column in self._columns] for one in each]
+        if len(self._rows) >= ROW_GROUP:
             self._write()
 
     def close(self, lacks: dict[str, str]) -> None:
@@ -78,7 +79,7 @@ def columns(topic: Topic) -> list[Column]:
 
 
 def _value(name: str) -> Callable[[Recorded, Message], Any]:
-    return lambda _, message: getattr(message, name)
+    return lambda _, message: value_of(message, name)
 
 
 def _of_array(name: str, spec: ArraySpec) -> list[Column]:

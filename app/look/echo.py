@@ -86,7 +86,8 @@ def told(value: Any) -> str:
     if isinstance(value, np.ndarray):
         return of_array(value)
     if isinstance(value, list):
-        return ", ".join(text(item) for item in value) or "none"
+        return ", ".join(text(item) if isinstance(item, str) else "(" + "; ".join(
+            line.strip() for line in fields(item)) + ")" for item in value) or "none"
     if isinstance(value, float):
         return f"{value:.6g}"
     return "none" if value is None else text(str(value))

@@ -146,7 +146,7 @@ def picture_of(scene: Scene, imagination: Imagination | None, dpi: int) -> Pictu
     image(figure.add_subplot(grid[0, 2]), story.goal_rgb, "goal" if story.goal_rgb is not None else "no goal")
     planned = None
     if imagination and story.plan:
-        known = [belief for belief in story.beliefs.values() if belief.presence > PRESENT_ABOVE]
+        known = [each for belief in story.beliefs.values() for each in belief.each() if each.presence > PRESENT_ABOVE]
         planned = imagination.planned_view(story.plan.viewpoint, known, scene.seen)
     image(figure.add_subplot(grid[1, 2]), planned, "planned view, imagined")
     _curves(figure, grid, scene, of_object)
@@ -170,7 +170,7 @@ def _camera(axes: Axes, scene: Scene, imagination: Imagination | None, of_object
     image(axes, rgb, "camera")
     if rgb is None:
         return
-    for name, percept in scene.percepts.items():
+    for name, percept in ((name, one) for name, kind in scene.percepts.items() for one in kind.each()):
         if percept.presence <= PRESENT_ABOVE:
             continue
         colour, mask = of_object.get(name, "black"), percept.mask()

@@ -63,7 +63,7 @@ class Story:
             self.last_rgb, self.last_step = message.rgb, message.step
         elif isinstance(message, Belief) and part is not None:
             self.beliefs[part] = message
-            terms = np.array([getattr(message, name) for name in F_TERMS])
+            terms = np.array([sum(getattr(each, name) for each in message.each()) for name in F_TERMS])
             self.energies[message.step] = self.energies.get(message.step, 0.0) + terms
         elif isinstance(message, Truth):
             self.truth = message
@@ -185,12 +185,19 @@ def table_from_above(axes: Axes, title: str) -> None:
 
 
 def particles(axes: Axes, beliefs: dict[str, Belief], names: Iterable[str]) -> None:
-    """Draws where objects are believed to be. Each of `names` has its own colour, whichever of them are drawn."""
+    """Draws where objects are believed to be, and the numbers of several of a kind. Each of `names` has its own colour,
+    whichever of them are drawn."""
     for name, colour in colours(names).items():
-        if name in beliefs:
-            x_m, y_m = beliefs[name].particles_m[:, :2].T
+        for belief in beliefs[name].each() if name in beliefs else []:
+            if belief is not beliefs[name] and belief.presence < 0.5:
+                continue
+            x_m, y_m = belief.particles_m[:, :2].T
             axes.scatter(x_m, y_m, s=4, color=colour, alpha=0.35, linewidths=0, zorder=2)
-            axes.plot(*beliefs[name].mean_m[:2], "o", color=colour, markersize=7, label=name, zorder=3)
+            axes.plot(*belief.mean_m[:2], "o", color=colour, markersize=7, zorder=3,
+                      label=name if belief is beliefs[name] else None)
+            if beliefs[name].further:
+                x, y, _ = map(float, belief.mean_m)
+                axes.annotate(str(belief.instance), (x, y), fontsize=8, zorder=4)
 
 
 def colours(names: Iterable[str]) -> dict[str, str]:

@@ -123,13 +123,22 @@ def differences(topic: Topic, part: str | None, recorded: Message, replayed: Mes
     """Yields the fields in which two messages differ, tolerated or not."""
     for entry in dataclasses.fields(recorded):
         old, new = getattr(recorded, entry.name), getattr(replayed, entry.name)
-        if entry.name in IGNORED or np.array_equal(old, new):
+        if entry.name in IGNORED or (not _lists_messages(old, new) and np.array_equal(old, new)):
+            continue
+        if _lists_messages(old, new) and len(old) == len(new):
+            for n, pair in enumerate(zip(old, new, strict=True)):
+                yield from (dataclasses.replace(found, field=f"{entry.name}[{n}].{found.field}")
+                            for found in differences(topic, part, *pair))
             continue
         if old is None and entry.name in ADDED.get(type(recorded), ()):  # the recording's format did not have it
             continue
         size, tolerated = _size(topic.name, entry.name, old, new)
         yield Difference(topic.name, part, recorded.episode, recorded.step, entry.name, *_texts(old, new), size,
                          tolerated)
+
+
+def _lists_messages(*values: Any) -> bool:
+    return any(isinstance(value, list) and value and isinstance(value[0], Message) for value in values)
 
 
 def _size(topic: str, name: str, old: Any, new: Any) -> tuple[float, bool]:
@@ -163,4 +172,6 @@ def _texts(old: Any, new: Any) -> tuple[str, str]:
 def _text(value: Any) -> str:
     if isinstance(value, np.ndarray):
         return f"{value.dtype} {list(value.shape)}"
+    if _lists_messages(value):
+        return f"{len(value)} messages"
     return f"{value:.9g}" if isinstance(value, (float, np.floating)) else str(value)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from types import TracebackType
 
 import numpy as np
@@ -79,6 +80,11 @@ class Progress:
         return self.plan.believed_distance_m
 
 
+def each_of(beliefs: Mapping[str, Belief]) -> list[Belief]:
+    """All instances, by the names of the objects and by their numbers."""
+    return [each for _, belief in sorted(beliefs.items()) for each in belief.each()]
+
+
 def spread_cm(belief: Belief) -> float:
     """Standard deviation of a believed position over all axes, in centimetres."""
     return 100 * float(np.sqrt(max(np.trace(belief.covariance_m2), 0.0)))
@@ -97,7 +103,7 @@ def line(progress: Progress) -> str:
             parts.append(f"believed {_metres(progress.believed_distance_m)}")
         parts.append(f"{plan.mode} {plan.target}".strip())
         parts.append(f"G {plan.g:.1f}")
-    parts += [f"{name} ±{spread_cm(belief):.1f} cm" for name, belief in sorted(progress.beliefs.items())
+    parts += [f"{belief.label()} ±{spread_cm(belief):.1f} cm" for belief in each_of(progress.beliefs)
               if belief.presence > 0.5]
     return "  ".join(parts)
 
@@ -132,9 +138,9 @@ def _belief_table(progress: Progress) -> RenderableType:
     table = Table(box=None, padding=(0, 2))
     for header in ("object", "present", "where (m)", "± cm", "views"):
         table.add_column(header, justify="left" if header == "object" else "right")
-    for name, belief in sorted(progress.beliefs.items()):
+    for belief in each_of(progress.beliefs):
         x, y, z = belief.mean_m
-        table.add_row(cell(name), f"{belief.presence:.2f}", f"{x:.2f}, {y:.2f}, {z:.2f}",
+        table.add_row(cell(belief.label()), f"{belief.presence:.2f}", f"{x:.2f}, {y:.2f}, {z:.2f}",
                       f"{spread_cm(belief):.1f}", str(belief.views), style="" if belief.presence > 0.5 else "dim")
     return table
 

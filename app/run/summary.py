@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from saccade.app.run.display import Progress, spread_cm
+from saccade.app.run.display import Progress, each_of, spread_cm
 from saccade.shared.bus.messages import Result
 from saccade.shared.config import Config
 
@@ -14,10 +14,15 @@ def summary(config: Config, results: list[Result], progress: Progress) -> list[s
         lines += _camera_lines(config, progress)
     lines += _doubts(config, progress)
     if config.scene.explore:
-        found = [belief for _, belief in sorted(progress.beliefs.items()) if belief.presence > 0.5]
-        for belief in found:
+        for belief in each_of(progress.beliefs):
+            if belief.presence <= 0.5:
+                continue
             where = ", ".join(f"{x:.3f}" for x in belief.mean_m)
-            lines.append(f"found {belief.object} at ({where}) m ± {spread_cm(belief):.1f} cm")
+            lines.append(f"found {belief.label()} at ({where}) m ± {spread_cm(belief):.1f} cm")
+        for name, kind in sorted(progress.beliefs.items()):
+            count, probability = kind.count()
+            if kind.further:
+                lines.append(f"there are {count} of {name} (probability {probability:.2f})")
     elif len(results) > 1 and config.scene.goal_image is None:
         lines.append(f"reached {sum(r.success for r in results)} of {len(results)} goals")
     return lines

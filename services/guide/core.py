@@ -79,9 +79,10 @@ class Guide:
 
     def _outlines(self, plan: Plan, frame: Frame) -> list[dict[str, Any]]:
         """The believed objects, as they will be seen in the image at the viewpoint."""
-        return [{"name": name, "points": _points(points)} for name, belief in sorted(self._beliefs.copy().items())
+        each = [belief for _, kind in sorted(self._beliefs.copy().items()) for belief in kind.each()]
+        return [{"name": belief.label(), "points": _points(points)} for belief in each
                 if belief.presence >= SEEN and len(points := outline(
-                    plan.viewpoint, belief.mean_m, self._sizes_m[name], frame.intrinsics_px))]
+                    plan.viewpoint, belief.mean_m, self._sizes_m[belief.object], frame.intrinsics_px))]
 
     def image(self) -> bytes | None:
         """The newest image as JPEG. None if there is none yet."""

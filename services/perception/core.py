@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -19,6 +19,7 @@ from saccade.services.perception.paper import PaperSceneCCN
 from saccade.services.perception.posecnn import PoseCNN
 from saccade.services.perception.same_view import Agreement, SameView
 from saccade.services.perception.seen import Seen, bits
+from saccade.services.perception.several import AGAINST, Group, groups
 from saccade.shared.bus.messages import Frame, Goal, Percept
 from saccade.shared.bus.topics import FRAME, GOAL, GOAL_PERCEPT, PERCEPT, Output
 from saccade.shared.config import Config
@@ -26,6 +27,7 @@ from saccade.shared.errors import SaccadeError
 from saccade.shared.loop.service import Inputs, Service
 from saccade.shared.model.generative_model import Decoder, Encoder, Stacked
 from saccade.shared.model.weights import WITH_LATENTS, Weights
+from saccade.shared.world.geometry import REFERENCE_RANGE_M
 from saccade.shared.world.windows import Window
 
 SERVICE = Service("perception", inputs=(FRAME, GOAL), trigger=FRAME, outputs=(PERCEPT, GOAL_PERCEPT),
@@ -35,7 +37,7 @@ GOAL_UP = (0.0, 1.0, 0.0)  # of a goal image nothing is known but that it stands
 
 @dataclass(frozen=True)
 class Found:
-    """K objects as found in an image.
+    """K objects as found in an image, and further ones of the objects `kinds`, which are the rows after the first K.
 
     crops [K, 3, 64, 64] and their masks [K, 1, 64, 64]; the windows that the objects fill; presences [K]; standard
     deviations of the windows (two of the place in crop sides, one of the log scale) [K, 3]; sides of the crops in
@@ -50,6 +52,7 @@ class Found:
     deviation: NDArray[np.float64]
     side_px: NDArray[np.float64]
     mask_bits: NDArray[np.uint8]
+    kinds: tuple[int, ...] = ()
 
 
 class SceneCCN:
@@ -77,29 +80,64 @@ class SceneCCN:
         found = self.find(rgb, intrinsics_px, up)
         crops, crop_masks, window, deviation = found.crops, found.crop_masks, found.window, found.deviation
         masked = torch.cat([crops * crop_masks, crop_masks], dim=1)
-        mean, std = (x[:, 0] for x in self.encoder(masked[:, None]))
-        error = ((self.decoder(mean[:, None])[:, 0] * crop_masks - masked[:, :3]) ** 2).sum((1, 2, 3))
+        mean, std = (x[:, 0] for x in self._by(self.encoder, masked[:, None], found.kinds))
+        drawn = self._by(self.decoder, mean[:, None], found.kinds)[:, 0]
+        error = ((drawn * crop_masks - masked[:, :3]) ** 2).sum((1, 2, 3))
         return Seen(found.presence, window.pixels, found.side_px * deviation[:, :2].mean(1), window.scales,
-                    deviation[:, 2], mean.numpy(), std.numpy(), error.double().numpy(), found.mask_bits)
+                    deviation[:, 2], mean.numpy(), std.numpy(), error.double().numpy(), found.mask_bits,
+                    kinds=found.kinds)
+
+    def _by(self, networks: Stacked, inputs: torch.Tensor, kinds: tuple[int, ...]) -> Any:
+        """The outputs of networks for K objects, and for further ones of the objects `kinds`, [K + len(kinds), ...]."""
+        first = networks(inputs[:len(self.cards)])
+        if not kinds:  # an object that is there once costs no more than before
+            return first
+        rest = networks.some(kinds, inputs[len(self.cards):])
+        if isinstance(first, torch.Tensor):
+            return torch.cat([first, rest])
+        return tuple(map(torch.cat, zip(first, rest, strict=True)))
+
+    def _sorted(self, masks: torch.Tensor, vote_logits: torch.Tensor, votes: torch.Tensor, focal_widths: float) -> \
+            tuple[torch.Tensor, torch.Tensor, torch.Tensor, tuple[int, ...]]:
+        """Masks, votes and kinds with a further row for each further one of a kind. `focal_widths` is the focal length
+        in image widths."""
+        further: list[tuple[int, Group]] = []
+        for k, card in enumerate(self.cards):
+            several = groups(vote_logits[k], votes[k], card.radius_m / REFERENCE_RANGE_M * focal_widths,
+                             masks.shape[-1])
+            if several:
+                vote_logits, masks = vote_logits.clone(), masks.clone()
+                vote_logits[k] = several[0].vote_logits
+                further += [(k, group) for group in several[1:]]
+                first_of = masks[k].clone()
+                masks[k] = first_of.masked_fill(~several[0].own, AGAINST)
+                rest = [first_of.masked_fill(~group.own, AGAINST) for group in several[1:]]
+                masks = torch.cat([masks, torch.stack(rest)])
+                vote_logits = torch.cat([vote_logits, torch.stack([group.vote_logits for group in several[1:]])])
+        kinds = tuple(k for k, _ in further)
+        return masks, vote_logits, torch.cat([votes, votes[list(kinds)]]) if kinds else votes, kinds
 
     @torch.inference_mode()
     def find(self, rgb: NDArray[np.uint8], intrinsics_px: ArrayLike, up: ArrayLike) -> Found:
         """Finds all objects in an image, and cuts them out. The arguments are those of `see`."""
         image = torch.from_numpy(np.array(rgb)).permute(2, 0, 1).float() / 255.0
         small = F.interpolate(image[None], size=(INPUT_PX, INPUT_PX), mode="area")
+        focal_px = float(np.asarray(intrinsics_px)[0])
         masks, vote_logits, votes = (x[0, self.rows] for x in self.extraction(small))
+        masks, vote_logits, votes, kinds = self._sorted(masks, vote_logits, votes, focal_px / rgb.shape[1])
+        sides_m = np.concatenate([self.sides_m, self.sides_m[list(kinds)]]) if kinds else self.sides_m
         logit, center, log_scale = tally(vote_logits, votes)
         cropper = Cropper(image, masks.sigmoid(), intrinsics_px, up)
-        window = Window(center.double().numpy() * rgb.shape[1], log_scale.exp().double().numpy(), self.sides_m)
+        window = Window(center.double().numpy() * rgb.shape[1], log_scale.exp().double().numpy(), sides_m)
         for _ in range(self.passes):
             crops, crop_masks = cropper.cut(window)
             raw = torch.cat([crops, crop_masks], dim=1)
-            identity_logit, correction, log_std = (x[:, 0] for x in self.identity(raw[:, None]))
+            identity_logit, correction, log_std = (x[:, 0] for x in self._by(self.identity, raw[:, None], kinds))
             before, window = window, cropper.corrected(window, correction.double().clamp(-0.5, 0.5).numpy())
         presence = (logit.sigmoid() * identity_logit.sigmoid()).double().numpy()
         deviation = log_std.exp().double().numpy()
-        side_px = 2 * before.half_tangent * float(np.asarray(intrinsics_px)[0])
-        return Found(cropper, crops, crop_masks, window, presence, deviation, side_px, bits((masks > 0).numpy()))
+        side_px = 2 * before.half_tangent * focal_px
+        return Found(cropper, crops, crop_masks, window, presence, deviation, side_px, bits((masks > 0).numpy()), kinds)
 
 
 class Model(Protocol):
@@ -159,15 +197,19 @@ class Perception:
             yield from self._goal(model, inputs["goal"])
         seen = self._seen(model, frame)
         for k, name in enumerate(self.names):
-            told, agrees = percept(frame, name, seen, k, frame.world_from_camera), self._agreement(k, frame, seen)
-            if agrees is not None:
-                told = replace(told, goal_agreement=agrees.share, goal_aside_rad=agrees.aside_rad)
-            yield Output(PERCEPT, told, name)
+            told, *further = [self._told(k, row, frame, seen) for row in seen.rows_of(k)]
+            yield Output(PERCEPT, replace(told, further=further) if further else told, name)
 
-    def _agreement(self, k: int, frame: Frame, seen: Seen) -> Agreement | None:
+    def _told(self, k: int, row: int, frame: Frame, seen: Seen) -> Percept:
+        """The percept of a row of what was seen, which is of object `k`."""
+        told = percept(frame, self.names[k], seen, row, frame.world_from_camera)
+        agrees = self._agreement(k, row, frame, seen)
+        return told if agrees is None else replace(told, goal_agreement=agrees.share, goal_aside_rad=agrees.aside_rad)
+
+    def _agreement(self, k: int, row: int, frame: Frame, seen: Seen) -> Agreement | None:
         if self.same_view is None:
             return None
-        return self.same_view(k, frame.rgb, frame.intrinsics_px, frame.world_from_camera[2, :3], seen)
+        return self.same_view(k, frame.rgb, frame.intrinsics_px, frame.world_from_camera[2, :3], seen, row)
 
     def _seen(self, model: Model, frame: Frame) -> Seen:
         if self._last is None or not _same_view(self._last[0], frame):
@@ -176,7 +218,10 @@ class Perception:
         return self._last[1]
 
     def _goal(self, model: Model, goal: Goal) -> Iterable[Output]:
-        """The percepts of the goal image. Without a goal image the presence of every object is 0."""
+        """The percepts of the goal image. Without a goal image the presence of every object is 0. Of several of a kind
+        the goal is the one in the middle."""
+        size = (480, 480) if goal.rgb is None else goal.rgb.shape[:2]
+        middle = np.array([size[1], size[0]]) / 2
         if goal.rgb is None:
             blank = np.zeros((480, 480, 3), dtype=np.uint8)
             seen = model.see(blank, goal.intrinsics_px, GOAL_UP)
@@ -184,9 +229,11 @@ class Perception:
         else:
             seen = model.see(goal.rgb, goal.intrinsics_px, GOAL_UP, alone=True)
             if isinstance(model, SceneCCN) and self.features is not None:
-                self.same_view = SameView(self.features, model.sides_m, goal.rgb, goal.intrinsics_px, GOAL_UP, seen)
+                rows = [seen.goal_row(k, middle) for k in range(len(self.names))]
+                self.same_view = SameView(self.features, model.sides_m, goal.rgb, goal.intrinsics_px, GOAL_UP, seen,
+                                          rows)
         for k, name in enumerate(self.names):
-            yield Output(GOAL_PERCEPT, percept(goal, name, seen, k, np.eye(4)), name)
+            yield Output(GOAL_PERCEPT, percept(goal, name, seen, seen.goal_row(k, middle), np.eye(4)), name)
 
 
 def _same_view(a: Frame, b: Frame) -> bool:
@@ -196,7 +243,7 @@ def _same_view(a: Frame, b: Frame) -> bool:
 
 
 def percept(source: Frame | Goal, name: str, seen: Seen, k: int, world_from_camera: NDArray) -> Percept:
-    """The percept message of object `name`, which is number `k` in `seen`."""
+    """The percept message of object `name`, which is the row `k` of `seen`."""
     modes = seen.modes[k] if seen.modes else None
     return Percept(
         run=source.run, episode=source.episode, step=source.step, object=name, presence=float(seen.presence[k]),

@@ -8,7 +8,7 @@ manifest says "architecture": "open".
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -23,6 +23,7 @@ from saccade.services.perception.landmark_fit import FEATURES, Fit, LandmarkFit
 from saccade.services.perception.landmark_search import Found, LandmarkSearch
 from saccade.services.perception.likeness import COHORT, OBJECTS, USUAL, Cohort, LogOdds
 from saccade.services.perception.local_features import LocalFeatures
+from saccade.services.perception.matching import best_matches, further_matches, unclaimed
 from saccade.services.perception.placed import Placed
 from saccade.services.perception.proposer import Proposals, Proposer, half_tangent, propose, with_whole
 from saccade.services.perception.seen import Modes, Seen, bits
@@ -39,7 +40,6 @@ APART_RAD = 0.6  # views farther apart than this are compared separately
 CANDIDATES = 2  # things that are compared with each object, and views of each object that are compared with a thing
 MASK_PX = 60
 NEAR = 0.3  # of the image that things fill, from which on one may be nearer than the image is large
-SURELY = 0.9  # the presence that counts as sure
 CERTAIN = 25  # landmarks; where so many speak for what a thing is, it is nothing else
 TWINS = 0.1  # of a similarity: an object that is nearly as like may be a twin of what was found
 KEPT = 500  # pictures that are kept unpacked, of 16 kB each
@@ -49,6 +49,16 @@ ROLLS_RAD = 2 * np.pi / 8 * np.arange(8)  # in which a thing is tried that is li
 
 Array = NDArray[np.float64]
 NOT_SEEN = Modes(np.eye(3)[None], np.zeros(1), np.full(1, np.pi))
+
+
+@dataclass(frozen=True)
+class Round:
+    """Comparisons of pairs (object, thing, view): by the network, log odds against none, and fits of landmarks."""
+
+    pairs: list[tuple[int, int, int]]
+    compared: Compared
+    log_odds: Array
+    fits: dict[tuple[int, int], Fit]
 
 
 def open_world_of(weights: Weights, names: tuple[str, ...]) -> OpenWorld:
@@ -91,30 +101,50 @@ class OpenWorld:
         is not used. In an image that stands `alone`, landmarks are searched for in everything, in any roll."""
         things = self.things(rgb, intrinsics_px, up, whole=0.0 if alone else NEAR)
         count = len(self.banks)
-        seen = _nothing(count, rgb.shape)
         found = self.search(things, ROLLS_RAD.tolist()) if alone else {}
         things, similar = self.rolled_things(things, found)
         pairs = [pair for k in range(count) for pair in self._candidates(k, similar[k], found, whole=things.whole)]
-        fits = self.fitted(things, {(k, thing) for k, thing, _ in pairs}, found, similar, quick=not alone)
+        first = self._round(things, similar, pairs, found, quick=not alone)
+        matches = best_matches(count, first.pairs, first.log_odds, first.fits)
+        told = [(k, match, first) for k, match in enumerate(matches)]
+        more = [(k, thing, view) for k, thing in unclaimed(similar, matches, whole=things.whole)
+                for view in self._views(k, similar[k][thing])]
+        if more:
+            second = self._round(things, similar, more, found, quick=not alone)
+            odds = np.exp(np.clip(second.log_odds, -30, 30))
+            told += [(k, match, second) for k, match in further_matches(second.pairs, odds, second.fits)]
+        seen = _nothing(len(told), rgb.shape)
+        masks = F.interpolate(things.masks[:, None], size=(MASK_PX, MASK_PX), mode="bilinear")[:, 0] > 0.5
+        for row, (k, match, compared) in enumerate(told):
+            placed = Placed(self.banks[k], match, compared.compared, things, intrinsics_px, up)
+            self._tell(seen, row, k, match, placed, compared, similar[k][match.thing])
+            seen.mask_bits[row] = bits(masks[match.thing, None].numpy())[0]
+        return replace(seen, kinds=tuple(k for k, _, _ in told[count:]))
+
+    def _round(self, things: Things, similar: list[Tensor], pairs: list[tuple[int, int, int]],
+               found: Mapping[int, Found], *, quick: bool) -> Round:
+        """Compares things with objects, pairs (object, thing, view): those that are worth it."""
+        fits = self.fitted(things, {(k, thing) for k, thing, _ in pairs}, found, similar, quick=quick)
         pairs = _left(pairs, fits, similar)
         known = torch.stack([self.view(k, view) for k, _, view in pairs])
         compared = Compared(self.comparison(things.crops[[thing for _, thing, _ in pairs]], known))
-        masks = F.interpolate(things.masks[:, None], size=(MASK_PX, MASK_PX), mode="bilinear")[:, 0] > 0.5
         alike = torch.stack([similar[k][thing, view] for k, thing, view in pairs])
         odds = self.log_odds(alike, compared.same, *self.found(pairs, fits)).double().numpy() - self.many
-        for k, match in enumerate(self._matches(pairs, odds, fits)):
-            seen.presence[k] = match.presence
-            placed = Placed(self.banks[k], match, compared, things, intrinsics_px, up)
-            seen.pixel[k], seen.scale[k] = placed.pixel, REFERENCE_RANGE_M / placed.range_m
-            seen.pixel_std[k], seen.log_scale_std[k] = placed.pixel_std, placed.log_scale_std
-            seen.mask_bits[k] = bits(masks[match.thing, None].numpy())[0]
-            others = [(view, row) for row, (object_, thing, view) in enumerate(pairs)
-                      if object_ == k and thing == match.thing]
-            modes = placed.modes(similar[k][match.thing], others, SHARPNESS)
-            seen.modes[k] = modes
-            assert seen.camera_from_object is not None  # `_nothing` made it
-            seen.camera_from_object[k] = pose(modes.rotations[0], placed.ray * placed.range_m)
-        return seen
+        return Round(pairs, compared, odds, fits)
+
+    def _tell(self, seen: Seen, row: int, k: int, match: Match, placed: Placed, compared: Round,
+              similar: Tensor) -> None:
+        """Fills a row of what is `seen` with where object k is and how it is turned, by the similarities [V] of the
+        thing to its views."""
+        seen.presence[row] = match.presence
+        seen.pixel[row], seen.scale[row] = placed.pixel, REFERENCE_RANGE_M / placed.range_m
+        seen.pixel_std[row], seen.log_scale_std[row] = placed.pixel_std, placed.log_scale_std
+        others = [(view, number) for number, (object_, thing, view) in enumerate(compared.pairs)
+                  if object_ == k and thing == match.thing]
+        modes = placed.modes(similar, others, SHARPNESS)
+        seen.modes[row] = modes
+        assert seen.camera_from_object is not None  # `_nothing` made it
+        seen.camera_from_object[row] = pose(modes.rotations[0], placed.ray * placed.range_m)
 
     def _similar(self, crops: Tensor) -> list[Tensor]:
         """The normalised similarities of crops [P, 4, 64, 64] to the views of each object [P, V]."""
@@ -192,37 +222,21 @@ class OpenWorld:
         """Which things are compared with object k, and with which of its views: (object, thing, view). Things are like
         it by `similar` [P, V], or it was found there, or they are the `whole` image, the last one: what is near fills
         it."""
-        directions = self.banks[k].directions
         likest = similar.max(1).values.topk(min(CANDIDATES, len(similar))).indices.tolist()
         pairs = []
         last = {len(similar) - 1} if whole else set()
         for thing in sorted({*likest, *last, *(n for n, each in found.items() if each.object == k)}):
-            left = similar[thing].clone()
-            for _ in range(CANDIDATES):
-                view = int(left.argmax())
-                pairs.append((k, thing, view))
-                left[torch.from_numpy(directions @ directions[view] > np.cos(APART_RAD))] = -np.inf
+            pairs += [(k, thing, view) for view in self._views(k, similar[thing])]
         return pairs
 
-    def _matches(self, pairs: list[tuple[int, int, int]], log_odds: Array,
-                 fits: Mapping[tuple[int, int], Fit]) -> list[Match]:
-        """Where each object is likeliest. A thing is one object, or none of them: `log_odds` are those against none.
-        Where an object is sure to be in several things, as in the whole image and in a part of it, landmarks decide."""
-        odds = np.exp(np.clip(log_odds, -30, 30))
-        best: dict[tuple[int, int], int] = {}  # the row of the likeliest view of each object in each thing
-        for row, (k, thing, _) in enumerate(pairs):
-            if (k, thing) not in best or odds[row] > odds[best[k, thing]]:
-                best[k, thing] = row
-        total: dict[int, float] = {}
-        for (_, thing), row in best.items():
-            total[thing] = total.get(thing, 1.0) + float(odds[row])
-        matches = []
-        for k in range(len(self.banks)):
-            seen = [(float(odds[r]) / total[t], t, r) for (o, t), r in best.items() if o == k]
-            support = {t: fits[k, t].support if (k, t) in fits else 0.0 for _, t, _ in seen}
-            presence, thing, row = max(seen, key=lambda each: (min(each[0], SURELY), support[each[1]], each[0]))
-            matches.append(Match(thing, presence, pairs[row][2], row, fits.get((k, thing))))
-        return matches
+    def _views(self, k: int, similar: Tensor) -> list[int]:
+        """The views of object k with which a thing is compared, by its similarities [V] to all of them."""
+        directions, left, views = self.banks[k].directions, similar.clone(), []
+        for _ in range(CANDIDATES):
+            view = int(left.argmax())
+            views.append(view)
+            left[torch.from_numpy(directions @ directions[view] > np.cos(APART_RAD))] = -np.inf
+        return views
 
     @torch.inference_mode()
     def things(self, rgb: NDArray[np.uint8], intrinsics_px: ArrayLike, up: ArrayLike, *,

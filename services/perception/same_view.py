@@ -9,6 +9,7 @@ by this map, the crops must have the same colours (`colours.py`), which local fe
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -59,18 +60,21 @@ class SameView:
     """
 
     def __init__(self, features: LocalFeatures, sides_m: ArrayLike, rgb: NDArray[np.uint8], intrinsics_px: ArrayLike,
-                 up: ArrayLike, seen: Seen):
+                 up: ArrayLike, seen: Seen, rows: Sequence[int] | None = None):
+        self._rows = range(len(seen.presence)) if rows is None else rows  # of the goal's objects in `seen`
         self._features, self._sides_m = features, np.asarray(sides_m, dtype=np.float64)
         self._intrinsics_px, self._seen = np.asarray(intrinsics_px), seen
-        self._shown = {k: self._of(k, rgb, intrinsics_px, up, seen)
-                       for k, presence in enumerate(seen.presence) if presence > SHOWN}
+        self._shown = {k: self._of(k, row, rgb, intrinsics_px, up, seen)
+                       for k, row in enumerate(self._rows) if seen.presence[row] > SHOWN}
 
     def __call__(self, k: int, rgb: NDArray[np.uint8], intrinsics_px: ArrayLike, up: ArrayLike,
-                 seen: Seen) -> Agreement | None:
-        """How an image [H, W, 3] agrees with the goal image on object `k`. None if they are not compared."""
-        if k not in self._shown or seen.presence[k] < SHOWN or not self._may_be_same(k, intrinsics_px, seen):
+                 seen: Seen, row: int | None = None) -> Agreement | None:
+        """How an image [H, W, 3] agrees with the goal image on object `k`, which is the row `row` (by default `k`) of
+        what is `seen`. None if they are not compared."""
+        row = k if row is None else row
+        if k not in self._shown or seen.presence[row] < SHOWN or not self._may_be_same(k, row, intrinsics_px, seen):
             return None
-        there, here = self._shown[k], self._of(k, rgb, intrinsics_px, up, seen)
+        there, here = self._shown[k], self._of(k, row, rgb, intrinsics_px, up, seen)
         fewer = min(len(there.features.pixels), len(here.features.pixels))
         if fewer < FEWEST:
             return None
@@ -79,21 +83,22 @@ class SameView:
                                     (there.features.pixels[rows], here.features.pixels[columns])))
         more = max(unlike(there.crop, here.crop, affine) - USUAL, 0.0) if count else 0.0
         return Agreement(count / fewer * float(np.exp(-more / UNLIKE)),
-                         aside_of(affine, intrinsics_px, up, seen.pixel[k]))
+                         aside_of(affine, intrinsics_px, up, seen.pixel[row]))
 
-    def _may_be_same(self, k: int, intrinsics_px: ArrayLike, seen: Seen) -> bool:
-        here, there = (unit(pixel_rays(one.pixel[k], px)) for one, px in
-                       ((seen, intrinsics_px), (self._seen, self._intrinsics_px)))
-        larger = np.log(seen.scale[k] / self._seen.scale[k])
+    def _may_be_same(self, k: int, row: int, intrinsics_px: ArrayLike, seen: Seen) -> bool:
+        here, there = (unit(pixel_rays(one.pixel[at], px)) for one, px, at in
+                       ((seen, intrinsics_px, row), (self._seen, self._intrinsics_px, self._rows[k])))
+        larger = np.log(seen.scale[row] / self._seen.scale[self._rows[k]])
         return bool(here @ there > np.cos(ASIDE_RAD) and abs(larger) < LARGER)
 
     @torch.inference_mode()
-    def _of(self, k: int, rgb: NDArray[np.uint8], intrinsics_px: ArrayLike, up: ArrayLike, seen: Seen) -> Shown:
-        """An object as an image shows it."""
+    def _of(self, k: int, row: int, rgb: NDArray[np.uint8], intrinsics_px: ArrayLike, up: ArrayLike,
+            seen: Seen) -> Shown:
+        """Object `k`, the row `row` of what is `seen`, as an image shows it."""
         image = torch.from_numpy(np.array(rgb)).permute(2, 0, 1).float() / 255.0
-        mask = torch.from_numpy(mask_of(seen.mask_bits[k])).float()[None]
+        mask = torch.from_numpy(mask_of(seen.mask_bits[row])).float()[None]
         cropper = Cropper(image, mask, intrinsics_px, up)
-        window = Window(seen.pixel[k, None], seen.scale[k, None], self._sides_m[k, None])
+        window = Window(seen.pixel[row, None], seen.scale[row, None], self._sides_m[k, None])
         crop, own_mask = cropper.fine_masked(window, SIDE_PX)
         found, own = self._features(crop, MOST)[0], _widened(own_mask[0])
         column, row = found.pixels.long().clamp(0, SIDE_PX - 1).T

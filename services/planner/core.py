@@ -13,11 +13,12 @@ from dataclasses import replace
 import numpy as np
 
 from saccade.services.planner.candidates import draw
-from saccade.services.planner.declaring import UNLIKELY, Evidence, Rivals, fused_here
+from saccade.services.planner.declaring import UNLIKELY, Evidence, fused_here
 from saccade.services.planner.free_energy import Terms, expected_free_energy
 from saccade.services.planner.goal import Preference, infer_preference
 from saccade.services.planner.goal_views import Side, goal_eye, goal_viewpoint, heading
 from saccade.services.planner.hand import Hand
+from saccade.services.planner.instances import Tried, best_of, flat, score
 from saccade.services.planner.moving import OFTEN, ahead, carried, shifted
 from saccade.services.planner.place import Ground, PaperGround, Room, way_cost
 from saccade.shared.bus.messages import Action, Belief, Plan
@@ -70,18 +71,20 @@ class Planner:
         self.age = 0  # steps since the plan was chosen
         self.before: Array | None = None  # pose of the camera at the last step [4, 4]
         self.hand = Hand(self.config.planner.replan_every) if self.moved_by == "hand" else None
-        self.rivals = Rivals()
-        self.wanted: Array | None = None  # the rival direction [3] from which the agent is about to look
-        self.since = 0  # the step since which the target is as it is
+        self.target_instance = 1  # the one of the target's kind that the agent goes for
+        self.tried = {1: Tried()}  # by the number of the instance
         self.velocity_m: Array | None = None  # of the target, as believed [3]
-        self.is_near = False  # the goal's view is sure to be near, and the agent goes to where it is believed to be
-        self.visited: list[Array] = []  # camera poses [4, 4] at which the agent has arrived in the mode "goal"
         return ()
+
+    @property
+    def now(self) -> Tried:
+        """What was tried at the instance that the agent goes for."""
+        return self.tried[self.target_instance]
 
     def step(self, inputs: Inputs) -> Iterable[Output]:
         """Yields a plan and an action, computed from the beliefs about all objects at one step."""
-        beliefs: dict[str, Belief] = inputs["belief"]
-        stamp = beliefs[self.names[0]]
+        told: dict[str, Belief] = inputs["belief"]
+        stamp = told[self.names[0]]
         camera = stamp.world_from_camera
         if not self.goal_known:
             self.goal_known = True
@@ -92,9 +95,9 @@ class Planner:
             # A goal image that shows no known object sets no preference. The agent then explores.
             known = preference.confidence >= self.config.planner.goal_confidence
             self.preference = preference if known and not self.config.scene.explore else None
-        beliefs = self._follow(beliefs)
+        beliefs = self._follow(self._one_of_each(told, camera))
         spheres = self.obstacles(beliefs)
-        ground = PaperGround(spheres) if self.room is None else self.room.among(self._boxes(beliefs))
+        ground = self._ground(beliefs)
         beliefs = self._refine(beliefs, ground)
         self._note_rivals(beliefs)
         chosen, mode, eye = self.plan, self._mode(beliefs), self._believed_eye(beliefs, camera, ground)
@@ -116,6 +119,29 @@ class Planner:
         yield Output(ACTION, Action(run=plan.run, episode=plan.episode, step=plan.step, translation_m=translation,
                                     rotation_rad=rotation, arrived=declared))
 
+    def _one_of_each(self, told: dict[str, Belief], camera: Array) -> dict[str, Belief]:
+        """The beliefs about all instances, with the best one of the target's kind under the target's name."""
+        if self.preference is None:
+            return flat(told, None, 1)
+        target, each, scores = self.preference.target, told[self.preference.target].each(), {}
+        if [belief.instance for belief in each] == [self.target_instance]:
+            return flat(told, target, self.target_instance)
+        for belief in each:
+            beliefs = flat(told, target, belief.instance)
+            ground = self._ground(beliefs)
+            eye = goal_eye(belief, self.preference, self.symmetry[target], camera, ground)
+            blocked = eye is not None and bool(ground.is_blocked(eye[None])[0])
+            scores[belief.instance] = score(belief, eye, camera, self.tried.get(belief.instance), is_blocked=blocked)
+        number = best_of(scores, self.target_instance)
+        if number != self.target_instance:
+            self.target_instance, self.plan = number, None
+            self.tried.setdefault(number, Tried())
+        return flat(told, target, number)
+
+    def _ground(self, beliefs: dict[str, Belief]) -> Ground:
+        """Where the camera can be among the objects of these beliefs."""
+        return PaperGround(self.obstacles(beliefs)) if self.room is None else self.room.among(self._boxes(beliefs))
+
     def _follow(self, beliefs: dict[str, Belief]) -> dict[str, Belief]:
         """Takes what happened to the target, and returns the beliefs as they will be at the next image.
 
@@ -124,12 +150,11 @@ class Planner:
         target = self.preference.target if self.preference else None
         if target is None:
             return beliefs
-        if beliefs[target].since_step > self.since:
-            self.since, self.plan = beliefs[target].since_step, None
-            self.rivals, self.wanted, self.visited, self.is_near = Rivals(), None, [], False
+        if beliefs[target].since_step > self.now.since:
+            self.plan, self.tried[self.target_instance] = None, Tried(beliefs[target].since_step)
         self.velocity_m = velocity_m = beliefs[target].velocity_m
         if velocity_m is not None:
-            self.visited = [shifted(seen, velocity_m) for seen in self.visited]
+            self.now.visited = [shifted(seen, velocity_m) for seen in self.now.visited]
         return ahead(beliefs, target)
 
     def _refine(self, beliefs: dict[str, Belief], ground: Ground) -> dict[str, Belief]:
@@ -153,9 +178,9 @@ class Planner:
                 declared = target.goal_here > SURE_ALONE
             else:
                 evidence = self._evidence(target, camera)
-                self.is_near = evidence.is_enough
+                self.now.is_near = evidence.is_enough
                 declared = evidence.is_enough and self._is_at(eye, camera, evidence)
-                if not self.is_near:
+                if not self.now.is_near:
                     self._has_looked(target, camera, evidence.look, wrong=not evidence.is_beside and (
                         not evidence.rival or evidence.probability < UNLIKELY))
         self.age += 1
@@ -176,7 +201,7 @@ class Planner:
             return True, False
         target = beliefs[chosen.target] if chosen.mode == "goal" else None
         evidence = None if target is None else self._evidence(target, camera)
-        eye = eye if self.wanted is None else None  # whoever looks from elsewhere is not led back before
+        eye = eye if self.now.wanted is None else None  # whoever looks from elsewhere is not led back before
         verdict = self.hand.take(camera, evidence, eye)
         if verdict in ("wrong", "rival") and target is not None:
             self._has_looked(target, camera, self.hand.look, wrong=verdict == "wrong")
@@ -186,13 +211,13 @@ class Planner:
         """Keeps in mind which directions are likely now. Views that look the same are no rivals."""
         if self.preference is not None and self.config.planner.retry \
                 and self.symmetry[self.preference.target] == NONE:
-            self.rivals.take(beliefs[self.preference.target])
+            self.now.rivals.take(beliefs[self.preference.target])
 
     def _evidence(self, target: Belief, camera: Array) -> Evidence:
         fused = fused_here(target, camera, self.symmetry[target.object])
         return Evidence(target.goal_here, fused,
-                        self.rivals.beside(camera, target.mean_m) is not None,
-                        self.rivals.elsewhere(camera, target.mean_m), target.goal_agreement)
+                        self.now.rivals.beside(camera, target.mean_m) is not None,
+                        self.now.rivals.elsewhere(camera, target.mean_m), target.goal_agreement)
 
     def _is_at(self, eye: Array | None, camera: Array, evidence: Evidence) -> bool:
         """Whether the camera is where the goal's view is believed to be, `eye` [3], now that it was compared. Where
@@ -203,10 +228,10 @@ class Planner:
 
     def _has_looked(self, target: Belief, camera: Array, look: float, *, wrong: bool) -> None:
         """The agent has arrived and looked, and goes on: to a rival, if the view may be the goal's all the same."""
-        self.rivals.looked(camera, target.mean_m, look)
-        self.wanted = None if wrong else self.rivals.beside(camera, target.mean_m)
+        self.now.rivals.looked(camera, target.mean_m, look)
+        self.now.wanted = None if wrong else self.now.rivals.beside(camera, target.mean_m)
         if wrong and self.config.planner.retry:
-            self.visited.append(camera)
+            self.now.visited.append(camera)
 
     def _arrived(self, camera: Array, viewpoint: Array) -> bool:
         """Whether the camera is at the viewpoint, or as near as it can come."""
@@ -261,7 +286,7 @@ class Planner:
         believed = self._believed_eye(beliefs, camera, ground)
         if found is not None and believed is not None:
             target = beliefs[found.target]
-            eye = believed if self.wanted is None else target.mean_m + found.range_m * self.wanted
+            eye = believed if self.now.wanted is None else target.mean_m + found.range_m * self.now.wanted
             best, side = self._goal_viewpoint(found, target, eye), self._side(target, eye)
             eyes, gazes = np.vstack([side.eyes(eyes), best[:3, 3]]), np.vstack([gazes, target.mean_m])
         eyes = ground.within(eyes)
@@ -272,7 +297,7 @@ class Planner:
         else:  # of equally informative viewpoints the nearest is taken
             cost = terms.total + way_cost(eyes, camera)
         cost = cost + ground.hidden_cost(eyes, gazes)
-        leads = best is not None and (self.wanted is not None or self.is_near)
+        leads = best is not None and (self.now.wanted is not None or self.now.is_near)
         chosen = len(eyes) - 1 if leads else ground.best(cost, eyes, camera)
         if found is None or best is None:
             viewpoint = look_at(ground.nearest(eyes[chosen]), gazes[chosen])
@@ -291,7 +316,7 @@ class Planner:
 
         It grows with every wrong viewpoint. It has a limit, because otherwise the agent would forget what it knows.
         """
-        return min(1.0 + len(self.visited), DOUBT_LIMIT)
+        return min(1.0 + len(self.now.visited), DOUBT_LIMIT)
 
     def _side(self, target: Belief, eye: Array) -> Side:
         return Side(target.mean_m, self.symmetry[target.object], eye)
@@ -299,10 +324,10 @@ class Planner:
     def _visited_cost(self, eyes: Array, side: Side) -> Array:
         """Cost [N] (nats) of views of the target from `eyes` [N, 3] that are like views that were not the goal's."""
         cost = np.zeros(len(eyes))
-        if not self.visited:
+        if not self.now.visited:
             return cost
         rotations = rotation_towards(side.center - eyes)
-        for seen in map(side.pose, self.visited):
+        for seen in map(side.pose, self.now.visited):
             far = ((eyes - seen[:3, 3]) ** 2).sum(1) / VISITED_M ** 2
             turned = (rotation_angle(rotations, seen[:3, :3]) / VISITED_RAD) ** 2
             cost += VISITED_COST * np.exp(-0.5 * (far + turned))
@@ -321,7 +346,8 @@ class Planner:
     def _plan(self, stamp: Belief, mode: str, viewpoint: Array, gaze: Array, terms: Terms, chosen: int) -> Plan:
         return Plan(
             run=stamp.run, episode=stamp.episode, step=stamp.step, mode=mode, viewpoint=viewpoint, look_at_m=gaze,
-            target=self.preference.target if self.preference else "", g_position=float(terms.position[chosen]),
+            target=self.preference.target if self.preference else "", target_instance=self.target_instance,
+            g_position=float(terms.position[chosen]),
             g_scale=float(terms.scale[chosen]), g_pose=float(terms.pose[chosen]),
             g_information=float(terms.information[chosen]), candidates=len(terms.position), believed_distance_m=-1.0,
             goal_confidence=self.confidence,

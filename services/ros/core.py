@@ -5,6 +5,7 @@ from __future__ import annotations
 import colorsys
 import hashlib
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,7 @@ class Teller:
     def __init__(self, names: Sequence[str], frame: str) -> None:
         self._names, self._frame = tuple(names), frame
         self._beliefs: dict[str, Belief] = {}
+        self._shown: dict[str, dict[int, Belief]] = {}  # by object and number: the instances that were told last
         self._episode = ("", -1)
 
     def take(self, message: Message, time_ns: int) -> list[tuple[str, Any]]:
@@ -49,9 +51,20 @@ class Teller:
         told = [(POSE, viewpoint(message.viewpoint, self._frame, time_ns))]
         if self._beliefs:
             markers = [marker for k, name in enumerate(self._names) if name in self._beliefs
-                       for marker in markers_of(self._beliefs[name], k, self._frame, time_ns)]
+                       for marker in self._markers(self._beliefs[name], k, time_ns)]
             told.append((MARKERS, make(MARKERS, {"markers": markers})))
         return told
+
+
+    def _markers(self, belief: Belief, number: int, time_ns: int) -> list[Any]:
+        """The markers of all instances of object `number`. Those of instances that are not believed in any more are
+        removed."""
+        each = {one.instance: one for one in belief.each()}
+        gone = {instance: replace(one, presence=0.0) for instance, one in self._shown.get(belief.object, {}).items()
+                if instance not in each}
+        self._shown[belief.object] = each
+        return [marker for instance, one in sorted({**gone, **each}.items())
+                for marker in markers_of(one, number + len(self._names) * (instance - 1), self._frame, time_ns)]
 
 
 def viewpoint(world_from_camera: Array, frame: str, time_ns: int) -> Any:
@@ -72,7 +85,7 @@ def markers_of(belief: Belief, number: int, frame: str, time_ns: int) -> list[An
     label = np.eye(4)
     label[:3, 3] = belief.mean_m
     label[2, 3] += diameters_m.max() / 2 + TEXT_M
-    text = f"{belief.object} {belief.presence:.0%}"
+    text = f"{belief.label()} {belief.presence:.0%}"
     return [
         _marker("beliefs", number, SPHERE, action, frame, time_ns, shape, diameters_m, colour_of(belief.object)),
         _marker("names", number, TEXT, action, frame, time_ns, label, (0.0, 0.0, TEXT_M), (1.0, 1.0, 1.0, 1.0), text)]

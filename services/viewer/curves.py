@@ -39,7 +39,7 @@ class Curves:
         self._numbers("entropy", [np.nan if belief is None else entropy_nats(belief) for belief in known])
         self._numbers("presence", [np.nan if belief is None else belief.presence for belief in known])
         self._numbers("F", [sum(belief.free_energy if term == "total" else getattr(belief, f"f_{term}")
-                                for belief in beliefs.values()) for term in F_TERMS])
+                                for kind in beliefs.values() for belief in kind.each()) for term in F_TERMS])
 
     def plan(self, plan: Plan) -> None:
         """Logs the terms of G of the chosen viewpoint, and the believed distance to the goal (m)."""

@@ -51,25 +51,26 @@ class Images:
         self._image(CAMERA_IMAGE, frame.rgb)
 
     def percept(self, percept: Percept, width_px: int) -> None:
-        """Logs the box, the mask, the name and the presence of an object in the image, which is `width_px` wide."""
+        """Logs the boxes, the masks, the name and the presences of an object in the image, which is `width_px` wide.
+        It may be there several times."""
         path = f"{CAMERA_IMAGE}/{rr.escape_entity_path_part(percept.object)}"
         if percept.presence < SEEN:
             self._to.log(path, rr.Clear(recursive=True))
             return
         self._seen[percept.object] = percept
-        colour, label = self._colour_of(percept.object), f"{plain(percept.object)} {percept.presence:.2f}"
+        each = [one for one in percept.each() if one.presence >= SEEN]
+        colour, labels = self._colour_of(percept.object), [f"{plain(one.object)} {one.presence:.2f}" for one in each]
         if self._imagination is None:
-            self._to.log(f"{path}/box", rr.Points2D([percept.pixel], radii=DOT_PX, colors=[colour], labels=[label],
-                                                    show_labels=True))
+            self._to.log(f"{path}/box", rr.Points2D([one.pixel for one in each], radii=DOT_PX, colors=[colour],
+                                                    labels=labels, show_labels=True))
         else:
-            self._to.log(f"{path}/box", rr.LineStrips2D([self._imagination.frame_of(percept)], colors=[colour],
-                                                        labels=[label], show_labels=True))
-        mask = percept.mask()
-        if mask is not None and mask.any():
-            lines = outline(mask) * (width_px / len(mask))
+            self._to.log(f"{path}/box", rr.LineStrips2D([self._imagination.frame_of(one) for one in each],
+                                                        colors=[colour], labels=labels, show_labels=True))
+        masks = [mask for one in each if (mask := one.mask()) is not None and mask.any()]
+        if masks:
+            lines = np.concatenate([outline(mask) * (width_px / len(mask)) for mask in masks])
             self._to.log(f"{path}/mask", rr.LineStrips2D(
-                lines,  # type: ignore[arg-type]  # Rerun accepts an array [N, 2, 2] for N lines; its types lack that
-                colors=[colour], radii=0.8, draw_order=20))
+                lines, colors=[colour], radii=0.8, draw_order=20))
 
     def step(self, frame: Frame, percepts: dict[str, Percept]) -> None:
         """Logs the crops of the objects that are seen at a step, and below them their reconstructions."""
@@ -91,7 +92,7 @@ class Images:
                 self._viewpoint is not None and np.array_equal(plan.viewpoint, self._viewpoint)):
             return
         self._viewpoint = plan.viewpoint
-        known = [belief for belief in beliefs.values() if belief.presence >= SEEN]
+        known = [belief for kind in beliefs.values() for belief in kind.each() if belief.presence >= SEEN]
         self._image(IMAGINED, self._imagination.planned_view(plan.viewpoint, known, self._seen))
 
     def _image(self, path: str, rgb: NDArray[np.uint8]) -> None:

@@ -31,7 +31,7 @@ HAPPENED = {"moved": "was moved", "gone": "is gone", "back": "is back", "drifts"
 def happened(events: Events) -> list[str]:
     """What was noticed with one image, in words: a sentence for each event."""
     return [f"the {plain(name)} {HAPPENED.get(kind, kind)} ({100 * probability:.0f} %)"
-            for name, kind, probability in zip(events.objects, events.kinds, events.probabilities, strict=False)]
+            for name, kind, probability in zip(events.labels(), events.kinds, events.probabilities, strict=False)]
 
 
 def ending(result: Result) -> str:

@@ -27,6 +27,10 @@ PARTICLE_M, CANDIDATE_M, EVENT_M = 0.0025, 0.006, 0.012
 UNSEEN_GREY = 110  # particles of an object that is believed absent fade towards this grey
 
 
+def _path_of(label: str) -> str:
+    return f"world/objects/{rr.escape_entity_path_part(label)}"
+
+
 class World:
     """Logs to `world/`.
 
@@ -38,6 +42,7 @@ class World:
         self._to, self._colour_of, self._sizes_m = recording, colour_of, sizes_m
         self._path: deque[NDArray[np.float64]] = deque(maxlen=PATH_LENGTH)
         self._looks: dict[str, object] = {}  # by path: properties that are logged only when they change
+        self._shown: dict[str, set[str]] = {}  # by object: its instances that are shown
         self._to.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         side = (UPPER_M - LOWER_M)[:2]
         self._to.log("world/table", rr.Boxes3D(centers=[(0, 0, -0.006)], sizes=[(*side, 0.01)], colors=[TABLE],
@@ -47,6 +52,7 @@ class World:
         """Starts another episode: removes what belongs to the last one."""
         self._path.clear()
         self._looks.clear()
+        self._shown.clear()
         for path in OF_EPISODE:
             self._to.log(path, rr.Clear(recursive=True))
 
@@ -58,8 +64,19 @@ class World:
         self._to.log("world/path", rr.LineStrips3D([np.array(self._path)], colors=[PATH], radii=[0.0015]))
 
     def belief(self, belief: Belief) -> None:
-        """Logs the particles of an object, and the ellipsoid that contains it with probability 0.95."""
-        path, colour = f"world/objects/{rr.escape_entity_path_part(belief.object)}", self._colour_of(belief.object)
+        """Logs all instances of an object, and removes those that are not believed in any more."""
+        labels = {each.label() for each in belief.each()}
+        for label in sorted(self._shown.get(belief.object, set()) - labels):
+            path = _path_of(label)
+            self._to.log(path, rr.Clear(recursive=True))
+            self._looks = {at: look for at, look in self._looks.items() if not at.startswith(f"{path}/")}
+        self._shown[belief.object] = labels
+        for each in belief.each():
+            self._instance(each)
+
+    def _instance(self, belief: Belief) -> None:
+        """Logs the particles of an instance, and the ellipsoid that contains it with probability 0.95."""
+        path, colour = _path_of(belief.label()), self._colour_of(belief.object)
         share = 0.2 + 0.8 * round(8 * belief.presence) / 8
         faded = [round(UNSEEN_GREY + (part - UNSEEN_GREY) * share) for part in colour]
         cloud = rr.Points3D.from_fields(positions=belief.particles_m)
@@ -76,7 +93,7 @@ class World:
         vectors[:, 0] *= np.sign(np.linalg.det(vectors))
         look: dict[str, Any] = {}
         if appears:
-            look = {"colors": [colour], "labels": [plain(belief.object)], "show_labels": True}
+            look = {"colors": [colour], "labels": [plain(belief.label())], "show_labels": True}
         self._to.log(f"{path}/belief", rr.Ellipsoids3D.from_fields(
             centers=[belief.mean_m], half_sizes=[CHI_95 * np.sqrt(np.maximum(values, 1e-8))],
             quaternions=[rr.Quaternion(xyzw=quaternion(vectors))], **look))
@@ -86,7 +103,7 @@ class World:
         if events.objects:
             self._to.log(EVENTS, rr.Points3D(
                 events.positions_m, radii=EVENT_M, colors=[self._colour_of(name) for name in events.objects],
-                labels=[f"{plain(name)}: {kind}" for name, kind in zip(events.objects, events.kinds, strict=False)],
+                labels=[f"{plain(name)}: {kind}" for name, kind in zip(events.labels(), events.kinds, strict=False)],
                 show_labels=True))
 
     def plan(self, plan: Plan) -> None:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import typing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar, TypeVar
 
 import numpy as np
@@ -98,7 +98,7 @@ class Percept(Message):
     """What the networks of one object made of one image (paper, section 3.2), on `percept` and `goal_percept`. On
     `goal_percept` the camera's pose is unknown: the identity stands for it."""
 
-    VERSION: ClassVar[int] = 5
+    VERSION: ClassVar[int] = 6
 
     object: str
     """Name of the object."""
@@ -139,6 +139,12 @@ class Percept(Message):
     goal_aside_rad: float | None = None
     """By how much the azimuth of the goal's view is larger than that of this one, as these features are turned and
     shifted."""
+    further: list[Percept] = field(default_factory=list)
+    """What else in the image may be one of its kind, the likeliest first. These have no further ones."""
+
+    def each(self) -> list[Percept]:
+        """All percepts of the kind, this one first."""
+        return [self, *self.further]
 
     def mask(self) -> np.ndarray | None:
         """Where in the image the object is seen: truth values [M, M]. None if the message has no mask."""
@@ -149,9 +155,10 @@ class Percept(Message):
 
 @dataclass(frozen=True, kw_only=True)
 class Belief(Message):
-    """The posterior over one object: where it is, and from where it would look like the goal."""
+    """The posterior over one object: where it is, and from where it would look like the goal. Of several of a kind the
+    others are in `further`."""
 
-    VERSION: ClassVar[int] = 2
+    VERSION: ClassVar[int] = 3
 
     object: str
     """Name of the object."""
@@ -197,6 +204,27 @@ class Belief(Message):
     """The same: the position."""
     f_likelihood: float = 0.0
     """The same: the reconstruction of the crop."""
+    instance: int = 1
+    """Its number among those of its kind that were found in this episode, from 1. It stays the same."""
+    further: list[Belief] = field(default_factory=list)
+    """The others of its kind. Where there are several, the last one is one that was not seen yet and may be where
+    nobody has looked. These have no further ones."""
+    count_probabilities: Annotated[np.ndarray, array("f8", "C")] | None = None
+    """Probabilities that none, one, two and so on of its kind are in the scene. Absent in `further`."""
+
+    def each(self) -> list[Belief]:
+        """The beliefs about all of its kind, this one first."""
+        return [self, *self.further]
+
+    def label(self) -> str:
+        """Its name, with its number where it is not the first: `soup_can#2`."""
+        return label_of(self.object, self.instance)
+
+    def count(self) -> tuple[int, float]:
+        """How many of its kind are most likely in the scene, and the probability of this."""
+        shares = np.array([1.0 - self.presence, self.presence]) if self.count_probabilities is None \
+            else self.count_probabilities
+        return int(np.argmax(shares)), float(np.max(shares))
 
     @property
     def free_energy(self) -> float:
@@ -208,6 +236,8 @@ class Belief(Message):
 class Events(Message):
     """What the belief noticed with one image: objects that are not where they were. Mostly there are none."""
 
+    VERSION: ClassVar[int] = 2
+
     objects: list[str]
     """Names of the objects, one for each event."""
     kinds: list[str]
@@ -216,13 +246,19 @@ class Events(Message):
     """Where each is believed to be now; of one that is gone, where it was."""
     probabilities: Annotated[np.ndarray, array("f8", "N")]
     """Probability of each event, by what was seen."""
+    instances: Annotated[np.ndarray, array("u1", "N")]
+    """Their numbers among those of their kind, as the beliefs have them."""
+
+    def labels(self) -> list[str]:
+        """The objects' names, with their numbers where they are not the first: `soup_can#2`."""
+        return [label_of(name, number) for name, number in zip(self.objects, self.instances.tolist(), strict=True)]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Plan(Message):
     """The chosen viewpoint and the terms of its expected free energy G (paper, equation 5). G is their sum."""
 
-    VERSION: ClassVar[int] = 2
+    VERSION: ClassVar[int] = 3
 
     target: str
     """The object that the goal image shows; empty while exploring."""
@@ -252,6 +288,8 @@ class Plan(Message):
     """Positions of the best candidates, best first."""
     best_g: Annotated[np.ndarray, array("f4", "N")] | None = None
     """Their G, nats."""
+    target_instance: int = 1
+    """Number of the one of the target's kind that the viewpoint shows, as the beliefs have it."""
 
     @property
     def g(self) -> float:
@@ -385,6 +423,13 @@ class Status(Message):
     """Duration of the last step."""
     note: str = ""
     """What it says in words."""
+
+
+def items_of(hint: Any) -> type[Message] | None:
+    """The type of the messages that a field of this annotation lists. None if it lists none."""
+    inner = typing.get_args(hint)
+    is_list = typing.get_origin(hint) is list and isinstance(inner[0], type) and issubclass(inner[0], Message)
+    return inner[0] if is_list else None
 
 
 @functools.cache

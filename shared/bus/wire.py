@@ -17,7 +17,7 @@ from typing import Annotated, Any, NamedTuple
 import msgpack
 import numpy as np
 
-from saccade.shared.bus.messages import AnyMessage, ArraySpec, Message, field_types
+from saccade.shared.bus.messages import AnyMessage, ArraySpec, Message, field_types, items_of
 from saccade.shared.errors import printable
 
 ARRAY_EXTENSION = 1  # msgpack ext type: msgpack([dtype, shape]) followed by the array's bytes, row-major
@@ -26,6 +26,7 @@ MAX_BYTES = 32 * 1024 * 1024
 MAX_SMALL_BYTES = 1024 * 1024  # limit for a message without an image
 MAX_TEXT = 4096  # bytes
 MAX_LIST = 256
+MAX_ITEMS = 32  # messages in a list
 MAX_FIELDS = 64
 MAX_NAME = 64  # bytes of a field's name
 MAX_REASON = 200  # characters
@@ -40,7 +41,8 @@ class MessageError(ValueError):
         super().__init__(printable(text, MAX_REASON))
 
 
-def _pack_array(value: Any) -> msgpack.ExtType:
+def packed_array(value: Any) -> msgpack.ExtType:
+    """An array as it is in a message. Raises TypeError if it is none."""
     if not isinstance(value, np.ndarray):
         raise TypeError(f"cannot encode {type(value).__name__}")
     little = np.ascontiguousarray(value).astype(value.dtype.newbyteorder("<"), copy=False)
@@ -67,11 +69,28 @@ def _unpack_array(code: int, data: bytes) -> np.ndarray:
 def encode(message: Message) -> bytes:
     """Returns the bytes of a message. Raises MessageError if the message is not valid, so that no service can publish
     what another one must refuse."""
-    fields = {f.name: getattr(message, f.name) for f in dataclasses.fields(message)}
-    _check(type(message), fields)
-    payload = msgpack.packb({"type": type(message).__name__, "version": message.VERSION, **fields}, default=_pack_array)
+    payload = msgpack.packb(_map_of(type(message), message), default=packed_array)
     _check_size(type(message), payload)
     return payload
+
+
+def _map_of(message_type: type[Message], message: Message) -> dict[str, Any]:
+    """The checked fields of a message, and of the messages that it lists."""
+    fields = {f.name: getattr(message, f.name) for f in dataclasses.fields(message)}
+    _check(message_type, fields)
+    for name, item_type in _lists(message_type).items():
+        if any(not isinstance(item, item_type) or any(getattr(item, n) for n in _lists(item_type))
+               for item in fields[name]):
+            raise MessageError(f"{name}: not messages of the type {item_type.__name__} that list no others")
+        fields[name] = [_map_of(item_type, item) for item in fields[name]]
+    return {"type": message_type.__name__, "version": message.VERSION, **fields}
+
+
+@functools.cache
+def _lists(message_type: type[Message]) -> dict[str, type[Message]]:
+    """The fields that list messages, with the types of these."""
+    found = {name: items_of(hint) for name, hint in field_types(message_type).items()}
+    return {name: item_type for name, item_type in found.items() if item_type is not None}
 
 
 class Stamp(NamedTuple):
@@ -112,6 +131,11 @@ def decode(message_type: type[AnyMessage], payload: bytes) -> AnyMessage:
         raise MessageError(f"not msgpack ({type(error).__name__})") from error
     if len(fields) != count:
         raise MessageError("a field is there twice")
+    return _message(message_type, fields)
+
+
+def _message(message_type: type[AnyMessage], fields: dict[str, Any]) -> AnyMessage:
+    """A message from its map. Raises MessageError if it is not valid."""
     name, version = fields.pop("type", None), fields.pop("version", None)
     if type(name) is not str or name != message_type.__name__:
         raise MessageError(f"type: not a {message_type.__name__}")
@@ -119,6 +143,8 @@ def decode(message_type: type[AnyMessage], payload: bytes) -> AnyMessage:
         told = version if type(version) is int else type(version).__name__
         raise MessageError(f"version: {told}, not {message_type.VERSION}: it comes from another release")
     _check(message_type, fields)
+    for field, item_type in _lists(message_type).items():
+        fields[field] = [_message(item_type, item) for item in fields[field]]
     return message_type(**fields)
 
 
@@ -157,6 +183,10 @@ def _check_field(name: str, value: Any, kind: Any, dimensions: dict[str, int]) -
             raise MessageError(f"{name}: not a list of at most {MAX_LIST} texts")
         for text in value:
             _check_text(name, text)
+    elif items_of(kind) is not None:
+        if not isinstance(value, list) or len(value) > MAX_ITEMS or not all(isinstance(v, dict | Message)
+                                                                            for v in value):
+            raise MessageError(f"{name}: not a list of at most {MAX_ITEMS} messages")
     elif type(value) is not kind:
         raise MessageError(f"{name}: {type(value).__name__}, not {kind.__name__}")
     elif kind is str:
@@ -207,10 +237,18 @@ def scan(payload: bytes) -> int:
     """Returns the number of fields in a payload. It only reads the head of each value and builds no objects, however
     long the payload is.
 
-    Raises MessageError if the payload is not one map from names to numbers, truth values, texts, lists of texts and
-    arrays, or if it exceeds a limit.
+    Raises MessageError if the payload is not one map from names to numbers, truth values, texts, arrays, lists of
+    texts, and lists of such maps that have no lists of maps, or if it exceeds a limit.
     """
-    kind, count, at = _head(payload, 0)
+    count, at = _scan_map(payload, 0, lists=True)
+    if at != len(payload):
+        raise MessageError(f"{len(payload)} bytes, where its fields take {at}")
+    return count
+
+
+def _scan_map(payload: bytes, at: int, *, lists: bool) -> tuple[int, int]:
+    """The number of fields of the map at a position, which may have lists of maps, and the position after it."""
+    kind, count, at = _head(payload, at)
     if kind != "map" or count > MAX_FIELDS:
         raise MessageError(f"not a map of at most {MAX_FIELDS} fields")
     for _ in range(count):
@@ -221,20 +259,25 @@ def scan(payload: bytes) -> int:
         kind, size, at = _head(payload, start)
         if kind in ("map", "bytes"):
             raise _named(name, f"{kind}, which no message has")
-        items = 0
-        if kind == "list":
-            items, size = size, 0
-        if items > MAX_LIST:
-            raise _named(name, f"a list of {items}, more than {MAX_LIST}")
-        for _ in range(items):
-            kind, length, at = _head(payload, at)
-            if kind != "text":
-                raise _named(name, f"a list that holds {kind}, not texts")
-            at += length
-        at += size
-    if at != len(payload):
-        raise MessageError(f"{len(payload)} bytes, where its fields take {at}")
-    return count
+        at = _scan_items(payload, at, size, name, maps=lists) if kind == "list" else at + size
+    return count, at
+
+
+def _scan_items(payload: bytes, at: int, count: int, name: bytes, *, maps: bool) -> int:
+    """The position after the items of a list, which may be `maps`."""
+    if count > MAX_LIST:
+        raise _named(name, f"a list of {count}, more than {MAX_LIST}")
+    for number in range(count):
+        kind, length, content = _head(payload, at)
+        if kind == "map" and maps:
+            if number >= MAX_ITEMS:
+                raise _named(name, f"a list of more than {MAX_ITEMS} messages")
+            at = _scan_map(payload, at, lists=False)[1]
+            continue
+        if kind != "text":
+            raise _named(name, f"a list that holds {kind}, not texts")
+        at = content + length
+    return at
 
 
 def _named(name: bytes, what: str) -> MessageError:

@@ -11,17 +11,19 @@ from pathlib import Path
 from typing import Any
 
 import msgpack
+import numpy as np
 
 from saccade.shared.bus import messages as m
 from saccade.shared.bus.topics import Topic
-from saccade.shared.bus.wire import scan
+from saccade.shared.bus.wire import packed_array, scan
 from saccade.shared.errors import SaccadeError
 
 Fields = dict[str, Any]
 Change = Callable[[Topic, str | None, Fields], Fields]
 
 OLDEST = 1  # the format of logs that do not name one
-ADDED = {m.Percept: ("mask_bits",), m.Plan: ("best_eyes_m", "best_g")}  # fields that older logs lack; they become None
+# Fields that older logs lack, and that services tell now; they become None.
+ADDED = {m.Percept: ("mask_bits",), m.Plan: ("best_eyes_m", "best_g"), m.Belief: ("count_probabilities",)}
 
 SINCE = {"events": 7}  # topics that older formats do not have, and the format since which they exist
 
@@ -42,7 +44,7 @@ def count_in_episodes() -> Change:
 def with_masks_and_candidates() -> Change:
     """Format 2 to 3: percepts have a mask of where the object is seen, and plans have their best candidates."""
     def change(topic: Topic, part: str | None, fields: Fields) -> Fields:
-        if topic.type not in ADDED:
+        if topic.type not in (m.Percept, m.Plan):
             return fields
         return fields | {"version": 2} | dict.fromkeys(ADDED[topic.type])
 
@@ -94,9 +96,25 @@ def with_motion_and_comparisons() -> Change:
     return change
 
 
+def with_beliefs_of_instances() -> Change:
+    """Format 7 to 8: percepts and beliefs may be of several of a kind, and have numbers."""
+    added: dict[type[m.Message], Fields] = {
+        m.Percept: {"version": 6, "further": []},
+        m.Belief: {"version": 3, "instance": 1, "further": [], "count_probabilities": None},
+        m.Plan: {"version": 3, "target_instance": 1}}
+
+    def change(topic: Topic, part: str | None, fields: Fields) -> Fields:
+        if topic.type is m.Events:
+            numbers = np.ones(len(fields["objects"]), np.uint8)
+            return fields | {"version": 2, "instances": packed_array(numbers)}
+        return fields | added.get(topic.type, {})
+
+    return change
+
+
 CHANGES: tuple[Callable[[], Change], ...] = (count_in_episodes, with_masks_and_candidates, with_poses,
                                              with_several_rotations, with_places_and_instances,
-                                             with_motion_and_comparisons)
+                                             with_motion_and_comparisons, with_beliefs_of_instances)
 FORMAT = OLDEST + len(CHANGES)
 
 

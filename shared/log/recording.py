@@ -17,7 +17,7 @@ from mcap.data_stream import RecordBuilder
 from mcap.records import Channel, DataEnd, Footer, Metadata
 from mcap.writer import MCAP0_MAGIC, Writer
 
-from saccade.shared.bus.messages import ArraySpec, Message, field_types
+from saccade.shared.bus.messages import ArraySpec, Message, field_types, items_of
 from saccade.shared.bus.topics import Topic, parse_key
 from saccade.shared.bus.wire import ARRAY_EXTENSION, limit_of
 from saccade.shared.errors import SaccadeError
@@ -242,6 +242,8 @@ def _field_schema(hint: Any) -> dict[str, Any]:
                 "x-extension": ARRAY_EXTENSION, "x-dtype": spec.dtype, "x-shape": list(spec.shape)}
     if hint == list[str]:
         return {"type": "array", "items": {"type": "string"}}
+    if (item_type := items_of(hint)) is not None:  # of the same kind, but without any of its own
+        return {"type": "array", "items": {"$ref": "#"}, "description": f"messages of the type {item_type.__name__}"}
     simple = {str: "string", int: "integer", float: "number", bool: "boolean", type(None): "null"}
     if hint in simple:
         return {"type": simple[hint]}

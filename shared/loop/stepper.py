@@ -246,8 +246,13 @@ class Stepper:
 
 
 def _same(one: Message, other: Message) -> bool:
-    return all(np.array_equal(getattr(one, field.name), getattr(other, field.name))
-               for field in dataclasses.fields(one))
+    return all(_equal(getattr(one, field.name), getattr(other, field.name)) for field in dataclasses.fields(one))
+
+
+def _equal(one: Any, other: Any) -> bool:
+    if isinstance(one, list) and one and isinstance(one[0], Message):
+        return len(one) == len(other) and all(map(_same, one, other))
+    return np.array_equal(one, other)
 
 
 def settle(message: Message) -> Message:
@@ -264,4 +269,6 @@ def settle(message: Message) -> Message:
                 value.flags.aligned and value.flags.c_contiguous and not value.flags.writeable):
             changed[field.name] = np.array(value, order="C")
             changed[field.name].flags.writeable = False
+        elif isinstance(value, list) and value and isinstance(value[0], Message):
+            changed[field.name] = [settle(item) for item in value]
     return dataclasses.replace(message, **changed) if changed else message

@@ -152,6 +152,14 @@ class Stacked:
         return self._call(self.parameters, self.buffers, *inputs)
 
     @torch.inference_mode()
+    def some(self, which: Sequence[int], *inputs: Tensor):
+        """Evaluates the networks of the numbers `which`. Each may be there several times."""
+        rows = list(which)
+        parameters, buffers = ({name: value[rows] for name, value in held.items()}
+                               for held in (self.parameters, self.buffers))
+        return self._call(parameters, buffers, *inputs)
+
+    @torch.inference_mode()
     def one_by_one(self, *inputs: Tensor):
         """Computes the same in a slow loop, for the parity test and the benchmark."""
         results = [module(*(x[k] for x in inputs)) for k, module in enumerate(self._modules)]
