@@ -12,7 +12,9 @@ import io
 from dataclasses import dataclass
 from importlib import resources
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from saccade.shared.errors import SaccadeError
@@ -55,12 +57,29 @@ class LocalFeatures:
         return [Features(each["keypoints"].cpu() + 0.5, each["descriptors"].cpu()) for each in found]
 
 
-def mutual(alike: Tensor) -> tuple[Tensor, Tensor]:
+def mutual(alike: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """The rows [M] and columns [M] of a table of products of descriptors [N, K] that are each other's likest, if they
-    are alike enough."""
-    if not alike.numel():
-        none = torch.zeros(0, dtype=torch.int64)
+    are alike enough.
+
+    The maxima of the columns are found without their places, which takes a tenth of the time: what is its row's likest
+    and as large as its column's maximum is the likest of both.
+    """
+    if not alike.size:
+        none = np.zeros(0, dtype=np.int64)
         return none, none
-    best, which = alike.max(1)
-    rows = torch.nonzero((alike.argmax(0)[which] == torch.arange(len(which))) & (best > ALIKE))[:, 0]
+    which = alike.argmax(1)
+    best = alike[np.arange(len(which)), which]
+    rows = np.flatnonzero((best == alike.max(0)[which]) & (best > ALIKE))
+    _, first = np.unique(which[rows], return_index=True)  # of several that are exactly as like, the first one counts
+    rows = rows[np.sort(first)]
+    return rows, which[rows]
+
+
+def mutual_searched(alike: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The slow twin of `mutual`."""
+    if not alike.size:
+        none = np.zeros(0, dtype=np.int64)
+        return none, none
+    which = alike.argmax(1)
+    rows = np.flatnonzero((alike.argmax(0)[which] == np.arange(len(which))) & (alike.max(1) > ALIKE))
     return rows, which[rows]
