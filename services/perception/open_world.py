@@ -17,7 +17,7 @@ import torch.nn.functional as F
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from saccade.services.perception.comparer import Compared, Comparison
+from saccade.services.perception.comparer import Compared, Comparison, Half
 from saccade.services.perception.cropping import Cropper
 from saccade.services.perception.landmark_fit import FEATURES, Fit, LandmarkFit
 from saccade.services.perception.landmark_search import Found, LandmarkSearch
@@ -42,7 +42,7 @@ NEAR = 0.3  # of the image that things fill, from which on one may be nearer tha
 SURELY = 0.9  # the presence that counts as sure
 CERTAIN = 25  # landmarks; where so many speak for what a thing is, it is nothing else
 TWINS = 0.1  # of a similarity: an object that is nearly as like may be a twin of what was found
-KEPT = 500  # pictures that are kept unpacked, of 16 kB each
+KEPT = 200  # views that are kept as the comparison takes them, of 200 kB each
 SHARPNESS = 20.0  # of the similarities, where it is told how an object is turned
 LIKE_SOMETHING = 0.23  # a normalised similarity; a thing that is less like everything is rolled
 ROLLS_RAD = 2 * np.pi / 8 * np.arange(8)  # in which a thing is tried that is like nothing as it stands
@@ -74,7 +74,8 @@ class OpenWorld:
 
     def __init__(self, proposer: Proposer, encoder: ViewEncoder, comparison: Comparison, features: LocalFeatures,
                  banks: list[Bank], cohort: Cohort, log_odds: LogOdds = USUAL):
-        self.proposer, self.encoder, self.comparison = proposer.eval(), encoder.eval(), comparison.eval()
+        self.proposer, self.encoder, self.comparison = (  # in this order of memory they take less time
+            network.eval().to(memory_format=torch.channels_last) for network in (proposer, encoder, comparison))
         self.banks, self.log_odds = banks, log_odds
         self.vectors = [torch.from_numpy(bank.vectors) for bank in banks]
         self.features, self.cohort = features, cohort
@@ -82,7 +83,7 @@ class OpenWorld:
         self.search = LandmarkSearch(features, self.fits)
         self.many = float(np.log(max(len(banks) / OBJECTS, 1.0)))  # a thing is each of many more seldom
         self.likest = [cohort.likest(vectors) for vectors in self.vectors]
-        self._image = lru_cache(KEPT)(lambda k, view: banks[k].image(view))  # an agent sees the same views again
+        self._known = lru_cache(KEPT)(self._of_view)  # an agent sees the same views again
 
     @torch.inference_mode()
     def see(self, rgb: NDArray[np.uint8], intrinsics_px: ArrayLike, up: ArrayLike,
@@ -97,8 +98,7 @@ class OpenWorld:
         pairs = [pair for k in range(count) for pair in self._candidates(k, similar[k], found, whole=things.whole)]
         fits = self.fitted(things, {(k, thing) for k, thing, _ in pairs}, found, similar, quick=not alone)
         pairs = _left(pairs, fits, similar)
-        known = torch.stack([self.view(k, view) for k, _, view in pairs])
-        compared = Compared(self.comparison(things.crops[[thing for _, thing, _ in pairs]], known))
+        compared = self._compared(things, pairs)
         masks = F.interpolate(things.masks[:, None], size=(MASK_PX, MASK_PX), mode="bilinear")[:, 0] > 0.5
         alike = torch.stack([similar[k][thing, view] for k, thing, view in pairs])
         odds = self.log_odds(alike, compared.same, *self.found(pairs, fits)).double().numpy() - self.many
@@ -185,7 +185,18 @@ class OpenWorld:
 
     def view(self, k: int, view: int) -> Tensor:
         """A view of a bank [4, 64, 64] from 0 to 1."""
-        return torch.from_numpy(self._image(k, view)).permute(2, 0, 1).float() / 255.0
+        return torch.from_numpy(self.banks[k].image(view)).permute(2, 0, 1).float() / 255.0
+
+    def _compared(self, things: Things, pairs: list[tuple[int, int, int]]) -> Compared:
+        """What the comparison says of the pairs (object, thing, view)."""
+        wanted = [thing for _, thing, _ in pairs]
+        seen, known = self.comparison.of_seen(things.crops), [self._known(k, view) for k, _, view in pairs]
+        return Compared(self.comparison.halves(Half(seen.maps[wanted], seen.given[wanted]),
+                                               Half(*(torch.cat(part) for part in zip(*known, strict=True)))))
+
+    def _of_view(self, k: int, view: int) -> Half:
+        """Each view by itself, so that it does not matter which ones are kept: rounding may depend on the batch."""
+        return self.comparison.of_known(self.view(k, view)[None].contiguous(memory_format=torch.channels_last))
 
     def _candidates(self, k: int, similar: Tensor, found: Mapping[int, Found], *, whole: bool) -> \
             list[tuple[int, int, int]]:
