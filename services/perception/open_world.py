@@ -42,6 +42,8 @@ NEAR = 0.3  # of the image that things fill, from which on one may be nearer tha
 SURELY = 0.9  # the presence that counts as sure
 CERTAIN = 25  # landmarks; where so many speak for what a thing is, it is nothing else
 TWINS = 0.1  # of a similarity: an object that is nearly as like may be a twin of what was found
+FITTED = 2  # objects that a thing is likest, which are fitted to it where one image follows another, beside twins
+LIKE_NOTHING = 0.1  # a normalised similarity; a thing that is less like everything is not fitted there
 KEPT = 200  # views that are kept as the comparison takes them, of 200 kB each
 SHARPNESS = 20.0  # of the similarities, where it is told how an object is turned
 LIKE_SOMETHING = 0.23  # a normalised similarity; a thing that is less like everything is rolled
@@ -161,10 +163,12 @@ class OpenWorld:
                quick: bool = True) -> dict[tuple[int, int], Fit]:
         """How the landmarks of objects fit things, for those of the `pairs` (object, thing) where enough do. What was
         `found` is not fitted again. By the similarities to the objects' views, `similar`, the likest objects come
-        first, and where it is clear what a thing is, the others that are not nearly as like are left out."""
+        first, and where it is clear what a thing is, the others that are not nearly as like are left out. Where it must
+        be `quick`, only what is like enough is fitted."""
         fits = {(each.object, thing): each.fit for thing, each in (found or {}).items()}
         left = sorted(set(pairs) - fits.keys())
         if similar is not None:
+            left = [pair for pair in left if not quick or _worth_a_fit(*pair, similar)]
             left.sort(key=lambda pair: -_likeness(similar, *pair))
         wanted = sorted({thing for _, thing in left})
         seen = dict(zip(wanted, self.features(things.fine[wanted], FEATURES) if wanted else [], strict=True))
@@ -272,6 +276,12 @@ class OpenWorld:
 
 def _likeness(similar: Sequence[Tensor], k: int, thing: int) -> float:
     return float(similar[k][thing].max())
+
+
+def _worth_a_fit(k: int, thing: int, similar: Sequence[Tensor]) -> bool:
+    """Whether a thing is like something, and object k among what it is likest, or nearly so."""
+    mine, every = _likeness(similar, k, thing), sorted((_likeness(similar, o, thing) for o in range(len(similar))))
+    return every[-1] > LIKE_NOTHING and (mine >= every[-FITTED:][0] or mine > every[-1] - TWINS)
 
 
 def _may_be(k: int, thing: int, fits: Mapping[tuple[int, int], Fit], similar: Sequence[Tensor]) -> bool:
