@@ -42,8 +42,9 @@ NEAR = 0.3  # of the image that things fill, from which on one may be nearer tha
 SURELY = 0.9  # the presence that counts as sure
 CERTAIN = 25  # landmarks; where so many speak for what a thing is, it is nothing else
 TWINS = 0.1  # of a similarity: an object that is nearly as like may be a twin of what was found
-FITTED = 2  # objects that a thing is likest, which are fitted to it where one image follows another, beside twins
-LIKE_NOTHING = 0.1  # a normalised similarity; a thing that is less like everything is not fitted there
+LIKEST = 2  # objects that a thing is likest, which are looked for in it where one image follows another, beside twins
+LIKE_NOTHING = 0.1  # a normalised similarity; to a thing that is less like everything nothing is fitted there
+ABSENT = 5e-3  # the presence of an object that no thing is among the likest of
 KEPT = 200  # views that are kept as the comparison takes them, of 200 kB each
 SHARPNESS = 20.0  # of the similarities, where it is told how an object is turned
 LIKE_SOMETHING = 0.23  # a normalised similarity; a thing that is less like everything is rolled
@@ -79,12 +80,13 @@ class OpenWorld:
         self.proposer, self.encoder, self.comparison = (  # in this order of memory they take less time
             network.eval().to(memory_format=torch.channels_last) for network in (proposer, encoder, comparison))
         self.banks, self.log_odds = banks, log_odds
-        self.vectors = [torch.from_numpy(bank.vectors) for bank in banks]
+        self.vectors = torch.from_numpy(np.concatenate([bank.vectors for bank in banks]))
+        self.directions = [bank.directions for bank in banks]
         self.features, self.cohort = features, cohort
         self.fits = [LandmarkFit(bank.landmarks) for bank in banks]
         self.search = LandmarkSearch(features, self.fits)
         self.many = float(np.log(max(len(banks) / OBJECTS, 1.0)))  # a thing is each of many more seldom
-        self.likest = [cohort.likest(vectors) for vectors in self.vectors]
+        self.likest = cohort.likest(self.vectors)
         self._known = lru_cache(KEPT)(self._of_view)  # an agent sees the same views again
 
     @torch.inference_mode()
@@ -97,14 +99,17 @@ class OpenWorld:
         seen = _nothing(count, rgb.shape)
         found = self.search(things, ROLLS_RAD.tolist()) if alone else {}
         things, similar = self.rolled_things(things, found)
-        pairs = [pair for k in range(count) for pair in self._candidates(k, similar[k], found, whole=things.whole)]
-        fits = self.fitted(things, {(k, thing) for k, thing, _ in pairs}, found, similar, quick=not alone)
-        pairs = _left(pairs, fits, similar)
+        like = _likeness(similar)
+        worth = np.ones_like(like, dtype=bool) if alone else _worth_a_look(like)
+        pairs = [pair for k in range(count)
+                 for pair in self._candidates(k, similar[k], found, worth[k], whole=things.whole)]
+        fits = self.fitted(things, {(k, thing) for k, thing, _ in pairs}, found, like, quick=not alone)
+        pairs = _left(pairs, fits, like)
         compared = self._compared(things, pairs)
         masks = F.interpolate(things.masks[:, None], size=(MASK_PX, MASK_PX), mode="bilinear")[:, 0] > 0.5
         alike = torch.stack([similar[k][thing, view] for k, thing, view in pairs])
         odds = self.log_odds(alike, compared.same, *self.found(pairs, fits)).double().numpy() - self.many
-        for k, match in enumerate(self._matches(pairs, odds, fits)):
+        for k, match in self._matches(pairs, odds, fits).items():
             seen.presence[k] = match.presence
             placed = Placed(self.banks[k], match, compared, things, intrinsics_px, up)
             seen.pixel[k], seen.scale[k] = placed.pixel, REFERENCE_RANGE_M / placed.range_m
@@ -121,9 +126,8 @@ class OpenWorld:
     def _similar(self, crops: Tensor) -> list[Tensor]:
         """The normalised similarities of crops [P, 4, 64, 64] to the views of each object [P, V]."""
         vectors = self.encoder(crops)
-        mine = self.cohort.likest(vectors)
-        return [self.cohort.normalised(vectors @ bank.T, mine, likest)
-                for bank, likest in zip(self.vectors, self.likest, strict=True)]
+        every = self.cohort.normalised(vectors @ self.vectors.T, self.cohort.likest(vectors), self.likest)
+        return list(every.split([len(bank.vectors) for bank in self.banks], dim=1))
 
     def rolled_things(self, things: Things, found: Mapping[int, Found] | None = None) -> tuple[Things, list[Tensor]]:
         """Things, each rolled as it was found, or else so that it is most like something; and their similarities to the
@@ -159,21 +163,21 @@ class OpenWorld:
 
     @torch.inference_mode()
     def fitted(self, things: Things, pairs: Collection[tuple[int, int]],
-               found: Mapping[int, Found] | None = None, similar: Sequence[Tensor] | None = None, *,
+               found: Mapping[int, Found] | None = None, like: Array | None = None, *,
                quick: bool = True) -> dict[tuple[int, int], Fit]:
         """How the landmarks of objects fit things, for those of the `pairs` (object, thing) where enough do. What was
-        `found` is not fitted again. By the similarities to the objects' views, `similar`, the likest objects come
+        `found` is not fitted again. By the likenesses of the objects and things, `like` [K, P], the likest objects come
         first, and where it is clear what a thing is, the others that are not nearly as like are left out. Where it must
-        be `quick`, only what is like enough is fitted."""
+        be `quick`, so are things that are like nothing."""
         fits = {(each.object, thing): each.fit for thing, each in (found or {}).items()}
         left = sorted(set(pairs) - fits.keys())
-        if similar is not None:
-            left = [pair for pair in left if not quick or _worth_a_fit(*pair, similar)]
-            left.sort(key=lambda pair: -_likeness(similar, *pair))
+        if like is not None:
+            left = [(k, thing) for k, thing in left if not quick or like[:, thing].max() > LIKE_NOTHING]
+            left.sort(key=lambda pair: -like[pair])
         wanted = sorted({thing for _, thing in left})
         seen = dict(zip(wanted, self.features(things.fine[wanted], FEATURES) if wanted else [], strict=True))
         for k, thing in left:
-            if similar is not None and not _may_be(k, thing, fits, similar):
+            if like is not None and not _may_be(k, thing, fits, like):
                 continue
             half = float(things.window.half_tangent[thing])
             fit = self.fits[k](seen[thing], FINE_PX / 2 / half, FINE_PX, quick=quick)
@@ -202,16 +206,18 @@ class OpenWorld:
         """Each view by itself, so that it does not matter which ones are kept: rounding may depend on the batch."""
         return self.comparison.of_known(self.view(k, view)[None].contiguous(memory_format=torch.channels_last))
 
-    def _candidates(self, k: int, similar: Tensor, found: Mapping[int, Found], *, whole: bool) -> \
-            list[tuple[int, int, int]]:
+    def _candidates(self, k: int, similar: Tensor, found: Mapping[int, Found], worth: NDArray[np.bool_], *,
+                    whole: bool) -> list[tuple[int, int, int]]:
         """Which things are compared with object k, and with which of its views: (object, thing, view). Things are like
         it by `similar` [P, V], or it was found there, or they are the `whole` image, the last one: what is near fills
-        it."""
-        directions = self.banks[k].directions
+        it. Only what is `worth` it [P] is compared."""
+        directions = self.directions[k]
         likest = similar.max(1).values.topk(min(CANDIDATES, len(similar))).indices.tolist()
         pairs = []
         last = {len(similar) - 1} if whole else set()
         for thing in sorted({*likest, *last, *(n for n, each in found.items() if each.object == k)}):
+            if not worth[thing]:
+                continue
             left = similar[thing].clone()
             for _ in range(CANDIDATES):
                 view = int(left.argmax())
@@ -220,8 +226,8 @@ class OpenWorld:
         return pairs
 
     def _matches(self, pairs: list[tuple[int, int, int]], log_odds: Array,
-                 fits: Mapping[tuple[int, int], Fit]) -> list[Match]:
-        """Where each object is likeliest. A thing is one object, or none of them: `log_odds` are those against none.
+                 fits: Mapping[tuple[int, int], Fit]) -> dict[int, Match]:
+        """Where each object is likeliest, of those that were compared. A thing is one object, or none of them: `log_odds` are those against none.
         Where an object is sure to be in several things, as in the whole image and in a part of it, landmarks decide."""
         odds = np.exp(np.clip(log_odds, -30, 30))
         best: dict[tuple[int, int], int] = {}  # the row of the likeliest view of each object in each thing
@@ -231,12 +237,12 @@ class OpenWorld:
         total: dict[int, float] = {}
         for (_, thing), row in best.items():
             total[thing] = total.get(thing, 1.0) + float(odds[row])
-        matches = []
-        for k in range(len(self.banks)):
+        matches = {}
+        for k in sorted({k for k, _ in best}):
             seen = [(float(odds[r]) / total[t], t, r) for (o, t), r in best.items() if o == k]
             support = {t: fits[k, t].support if (k, t) in fits else 0.0 for _, t, _ in seen}
             presence, thing, row = max(seen, key=lambda each: (min(each[0], SURELY), support[each[1]], each[0]))
-            matches.append(Match(thing, presence, pairs[row][2], row, fits.get((k, thing))))
+            matches[k] = Match(thing, presence, pairs[row][2], row, fits.get((k, thing)))
         return matches
 
     @torch.inference_mode()
@@ -274,27 +280,28 @@ class OpenWorld:
                       np.zeros(len(found)))
 
 
-def _likeness(similar: Sequence[Tensor], k: int, thing: int) -> float:
-    return float(similar[k][thing].max())
+def _likeness(similar: Sequence[Tensor]) -> Array:
+    """How like each object each thing is [K, P]."""
+    return np.array([each.max(1).values.numpy() for each in similar], dtype=np.float64)
 
 
-def _worth_a_fit(k: int, thing: int, similar: Sequence[Tensor]) -> bool:
-    """Whether a thing is like something, and object k among what it is likest, or nearly so."""
-    mine, every = _likeness(similar, k, thing), sorted((_likeness(similar, o, thing) for o in range(len(similar))))
-    return every[-1] > LIKE_NOTHING and (mine >= every[-FITTED:][0] or mine > every[-1] - TWINS)
+def _worth_a_look(like: Array) -> NDArray[np.bool_]:
+    """Which objects are looked for in which things [K, P], where one image follows another: those that a thing is
+    likest, or nearly as like."""
+    count, first = min(LIKEST, len(like)), like.max(0)
+    return (like >= np.sort(like, axis=0)[-count]) | (like > first - TWINS)
 
 
-def _may_be(k: int, thing: int, fits: Mapping[tuple[int, int], Fit], similar: Sequence[Tensor]) -> bool:
+def _may_be(k: int, thing: int, fits: Mapping[tuple[int, int], Fit], like: Array) -> bool:
     """Whether a thing may be object k, by what its landmarks say of other objects. Twins are nearly as like."""
     clear = [other for (other, where), fit in fits.items() if where == thing and fit.support >= CERTAIN]
-    return not clear or k in clear or any(
-        _likeness(similar, k, thing) > _likeness(similar, other, thing) - TWINS for other in clear)
+    return not clear or k in clear or any(like[k, thing] > like[other, thing] - TWINS for other in clear)
 
 
-def _left(pairs: list[tuple[int, int, int]], fits: Mapping[tuple[int, int], Fit], similar: Sequence[Tensor]) -> \
+def _left(pairs: list[tuple[int, int, int]], fits: Mapping[tuple[int, int], Fit], like: Array) -> \
         list[tuple[int, int, int]]:
     """The pairs (object, thing, view) that are worth a comparison, in their order: at least one of each object."""
-    left = {pair for pair in pairs if _may_be(pair[0], pair[1], fits, similar)}
+    left = {pair for pair in pairs if _may_be(pair[0], pair[1], fits, like)}
     told = {k for k, _, _ in left}
     first = {k: pair for pair in reversed(pairs) if (k := pair[0]) not in told}
     return [pair for pair in pairs if pair in left or first.get(pair[0]) == pair]
@@ -305,5 +312,5 @@ def _nothing(count: int, shape: tuple[int, ...]) -> Seen:
     height, width = shape[:2]
     none, empty = np.zeros((count, 0), dtype=np.float32), np.zeros((count, MASK_PX, MASK_PX), dtype=bool)
     middle = np.tile([width / 2, height / 2], (count, 1)).astype(np.float64)
-    return Seen(np.zeros(count), middle, np.full(count, float(width)), np.ones(count), np.ones(count), none, none,
+    return Seen(np.full(count, ABSENT), middle, np.full(count, float(width)), np.ones(count), np.ones(count), none, none,
                 np.zeros(count), bits(empty), np.tile(np.eye(4), (count, 1, 1)), [NOT_SEEN] * count)
