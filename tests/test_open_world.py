@@ -160,7 +160,7 @@ def test_a_thing_is_one_object_or_none(bank):
     torch.manual_seed(2)
     model = OpenWorld(Proposer(), ViewEncoder(), Comparison(), LocalFeatures(), [bank, bank, bank], STRANGERS)
     matches = model._matches([(k, 0, 0) for k in range(3)], np.array([3.0, 2.0, -4.0]), {})
-    presence = [match.presence for match in matches]
+    presence = [match.presence for match in matches.values()]
     assert sum(presence) < 1.0
     assert presence[0] == pytest.approx(np.exp(3) / (1 + np.exp(3) + np.exp(2) + np.exp(-4)))
 
