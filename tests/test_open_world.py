@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from saccade.services.perception.comparer import Compared, Comparison
 from saccade.services.perception.likeness import UNIT, Cohort
 from saccade.services.perception.local_features import LocalFeatures
-from saccade.services.perception.open_world import Match, OpenWorld, Placed, Things, rolled
+from saccade.services.perception.open_world import Match, OpenWorld, Placed, Things, _worth_a_look, rolled
 from saccade.services.perception.proposer import STRIDE, Proposer, places, propose
 from saccade.services.perception.view_encoder import VECTOR, ViewEncoder
 from saccade.shared.model.bank import FILLED, bank_of, compressed
@@ -153,6 +153,23 @@ def test_any_size_is_seen_and_an_empty_picture_shows_nothing(bank, shape):
     assert len(seen.modes) == 2
     assert np.isfinite(seen.pixel).all()
     assert seen.latent_mean.shape == (2, 0)
+
+
+def test_a_crop_and_a_view_that_are_looked_at_once_compare_as_side_by_side():
+    """The first layer that sees both is linear, so that it may take them one after the other."""
+    torch.manual_seed(3)
+    comparison, seen, known = Comparison().eval(), torch.rand(3, 4, 64, 64), torch.rand(3, 4, 64, 64)
+    with torch.inference_mode():
+        apart = comparison.halves(comparison.of_seen(seen), comparison.of_known(known))
+        assert apart.numpy() == pytest.approx(comparison(seen, known).numpy(), abs=1e-4)
+        assert apart.numpy() != pytest.approx(comparison(seen, known.flip(0)).numpy(), abs=1e-3)
+
+
+def test_where_images_follow_one_another_a_thing_is_only_what_it_is_like():
+    """Its likest two, and what is nearly as like as the first."""
+    like = np.array([[0.5, 0.1], [0.45, 0.3], [0.42, 0.1], [0.1, 0.25]])  # of 4 objects and 2 things
+    assert _worth_a_look(like).T.tolist() == [[True, True, True, False], [False, True, False, True]]
+    assert _worth_a_look(like[:1]).all()
 
 
 def test_a_thing_is_one_object_or_none(bank):

@@ -227,8 +227,9 @@ class OpenWorld:
 
     def _matches(self, pairs: list[tuple[int, int, int]], log_odds: Array,
                  fits: Mapping[tuple[int, int], Fit]) -> dict[int, Match]:
-        """Where each object is likeliest, of those that were compared. A thing is one object, or none of them: `log_odds` are those against none.
-        Where an object is sure to be in several things, as in the whole image and in a part of it, landmarks decide."""
+        """Where each object is likeliest, of those that were compared. A thing is one object, or none of them:
+        `log_odds` are those against none. Where an object is sure to be in several things, as in the whole image and in
+        a part of it, landmarks decide."""
         odds = np.exp(np.clip(log_odds, -30, 30))
         best: dict[tuple[int, int], int] = {}  # the row of the likeliest view of each object in each thing
         for row, (k, thing, _) in enumerate(pairs):
@@ -312,5 +313,5 @@ def _nothing(count: int, shape: tuple[int, ...]) -> Seen:
     height, width = shape[:2]
     none, empty = np.zeros((count, 0), dtype=np.float32), np.zeros((count, MASK_PX, MASK_PX), dtype=bool)
     middle = np.tile([width / 2, height / 2], (count, 1)).astype(np.float64)
-    return Seen(np.full(count, ABSENT), middle, np.full(count, float(width)), np.ones(count), np.ones(count), none, none,
-                np.zeros(count), bits(empty), np.tile(np.eye(4), (count, 1, 1)), [NOT_SEEN] * count)
+    return Seen(np.full(count, ABSENT), middle, np.full(count, float(width)), np.ones(count), np.ones(count), none,
+                none, np.zeros(count), bits(empty), np.tile(np.eye(4), (count, 1, 1)), [NOT_SEEN] * count)
