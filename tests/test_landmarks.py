@@ -12,7 +12,7 @@ from safetensors.numpy import load_file
 from saccade.services.perception.comparer import Compared
 from saccade.services.perception.landmark_fit import FEATURES, FEWEST, LandmarkFit
 from saccade.services.perception.likeness import SURE
-from saccade.services.perception.local_features import LocalFeatures
+from saccade.services.perception.local_features import LocalFeatures, mutual, mutual_searched
 from saccade.services.perception.open_world import Match, Placed, Things, open_world_of, rolled
 from saccade.shared.config import WEIGHTS
 from saccade.shared.errors import SaccadeError
@@ -74,6 +74,26 @@ def test_an_object_is_known_also_where_it_is_so_near_that_the_border_cuts_it_off
         true = np.linalg.inv(near[1])
         assert fit.inliers > SURE
         assert float(rotation_angle(fit.camera_from_object[:3, :3], true[:3, :3])) < 0.06
+
+
+def test_features_are_those_of_the_package(features):
+    """The fast path leaves out a resizing to the same size, finds peaks by few comparisons, and has no normalisations
+    of its own: the same places to the pixel, the same descriptors but for rounding."""
+    images = torch.cat([picture(name, direction(0.3, 0.5))[0] for name in ("cereal_box", "soup_can")]
+                       + [torch.full((1, 3, SIDE_PX, SIDE_PX), 0.5)])
+    for most in (40, FEATURES):
+        for fast, slow in zip(features(images, most), features.by_package(images, most), strict=True):
+            assert fast.pixels.tolist() == slow.pixels.tolist()
+            assert fast.descriptors.numpy() == pytest.approx(slow.descriptors.numpy(), abs=1e-4)
+
+
+@pytest.mark.parametrize("shape", [(60, 200), (200, 60), (1, 5), (5, 1), (0, 7), (7, 0)])
+def test_mutual_matches_are_those_that_a_search_finds(shape):
+    """Where all are equal, the first counts."""
+    table = np.random.default_rng(4).uniform(-1.0, 1.0, shape).astype(np.float32)
+    for alike in (table, np.ones_like(table)):
+        for fast, slow in zip(mutual(alike), mutual_searched(alike), strict=True):
+            assert fast.tolist() == slow.tolist()
 
 
 def test_landmarks_of_one_object_do_not_fit_another(features, landmarks):

@@ -11,7 +11,7 @@ from saccade.services.perception.comparer import Compared, Comparison
 from saccade.services.perception.likeness import UNIT, Cohort
 from saccade.services.perception.local_features import LocalFeatures
 from saccade.services.perception.matching import best_matches, further_matches, unclaimed
-from saccade.services.perception.open_world import Match, OpenWorld, Placed, Things, rolled
+from saccade.services.perception.open_world import Match, OpenWorld, Placed, Things, _worth_a_look, rolled
 from saccade.services.perception.proposer import STRIDE, Proposer, places, propose
 from saccade.services.perception.view_encoder import VECTOR, ViewEncoder
 from saccade.shared.model.bank import FILLED, bank_of, compressed
@@ -156,10 +156,27 @@ def test_any_size_is_seen_and_an_empty_picture_shows_nothing(bank, shape):
     assert seen.latent_mean.shape == (2, 0)
 
 
+def test_a_crop_and_a_view_that_are_looked_at_once_compare_as_side_by_side():
+    """The first layer that sees both is linear, so that it may take them one after the other."""
+    torch.manual_seed(3)
+    comparison, seen, known = Comparison().eval(), torch.rand(3, 4, 64, 64), torch.rand(3, 4, 64, 64)
+    with torch.inference_mode():
+        apart = comparison.halves(comparison.of_seen(seen), comparison.of_known(known))
+        assert apart.numpy() == pytest.approx(comparison(seen, known).numpy(), abs=1e-4)
+        assert apart.numpy() != pytest.approx(comparison(seen, known.flip(0)).numpy(), abs=1e-3)
+
+
+def test_where_images_follow_one_another_a_thing_is_only_what_it_is_like():
+    """Its likest two, and what is nearly as like as the first."""
+    like = np.array([[0.5, 0.1], [0.45, 0.3], [0.42, 0.1], [0.1, 0.25]])  # of 4 objects and 2 things
+    assert _worth_a_look(like).T.tolist() == [[True, True, True, False], [False, True, False, True]]
+    assert _worth_a_look(like[:1]).all()
+
+
 def test_a_thing_is_one_object_or_none():
     """The probabilities of all objects in one thing sum to less than 1."""
-    matches = best_matches(3, [(k, 0, 0) for k in range(3)], np.array([3.0, 2.0, -4.0]), {})
-    presence = [match.presence for match in matches]
+    matches = best_matches([(k, 0, 0) for k in range(3)], np.array([3.0, 2.0, -4.0]), {})
+    presence = [match.presence for match in matches.values()]
     assert sum(presence) < 1.0
     assert presence[0] == pytest.approx(np.exp(3) / (1 + np.exp(3) + np.exp(2) + np.exp(-4)))
 
@@ -167,13 +184,13 @@ def test_a_thing_is_one_object_or_none():
 def test_one_more_of_an_object_is_what_is_as_like_it_and_no_other_object():
     """Things 0 and 2 are alike and like object 0, thing 1 is object 1, thing 3 is like nothing, and the last thing is
     the whole image: only thing 2 may be one more, and it is if the odds say so."""
-    similar = [torch.tensor([[0.9], [0.1], [0.85], [0.2], [0.9]]), torch.tensor([[0.1], [0.8], [0.2], [0.2], [0.5]])]
-    matches = [Match(0, 0.99, 0, 0, None), Match(1, 0.98, 0, 0, None)]
-    assert unclaimed(similar, matches, whole=True) == [(0, 2)]
+    like = np.array([[0.9, 0.1, 0.85, 0.2, 0.9], [0.1, 0.8, 0.2, 0.2, 0.5]])
+    matches = {0: Match(0, 0.99, 0, 0, None), 1: Match(1, 0.98, 0, 0, None)}
+    assert unclaimed(like, matches, whole=True) == [(0, 2)]
     assert [(k, match.thing) for k, match in further_matches([(0, 2, 0)], np.array([9.0]), {})] == [(0, 2)]
     assert further_matches([(0, 2, 0)], np.array([0.9]), {}) == []
-    absent = [Match(0, 0.2, 0, 0, None), Match(1, 0.98, 0, 0, None)]
-    assert unclaimed(similar, absent, whole=True) == []
+    absent = {0: Match(0, 0.2, 0, 0, None), 1: Match(1, 0.98, 0, 0, None)}
+    assert unclaimed(like, absent, whole=True) == []
 
 
 def test_a_similarity_counts_by_what_is_usual_for_the_crop_and_for_the_view():

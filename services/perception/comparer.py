@@ -6,7 +6,10 @@ vector cannot hold: the small differences between near twins, and by how much th
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from saccade.services.perception.networks import block, normed
@@ -14,8 +17,19 @@ from saccade.services.perception.networks import block, normed
 OUTPUTS = 11
 
 
+class Half(NamedTuple):
+    """What the comparer makes of one of two pictures: maps [B, W, 32, 32], and what they alone give to the first layer
+    that sees both [B, 2 W, 16, 16]."""
+
+    maps: Tensor
+    given: Tensor
+
+
 class Comparison(nn.Module):
-    """Crops with their masks [B, 4, 64, 64] and known views [B, 4, 64, 64] -> what `split` takes apart [B, 11]."""
+    """Crops with their masks [B, 4, 64, 64] and known views [B, 4, 64, 64] -> what `split` takes apart [B, 11].
+
+    A crop that is compared with many views is looked at once: see `of_seen`, `of_known` and `halves`.
+    """
 
     def __init__(self, width: int = 32) -> None:
         super().__init__()
@@ -27,10 +41,41 @@ class Comparison(nn.Module):
                                   nn.Linear(4 * width * 16, 256), nn.LeakyReLU(0.1), nn.Linear(256, OUTPUTS))
 
     def forward(self, seen: Tensor, known: Tensor) -> Tensor:
-        rgb, mask = seen[:, :3], seen[:, 3:]
-        own = self.seen(torch.cat([rgb, rgb * mask, mask], 1) - 0.25)
-        other = self.known(known - 0.25)
+        own, other = self._seen(seen), self.known(known - 0.25)
         return self.both(torch.cat([own, other, (own - other).abs()], 1)).float()
+
+    def _seen(self, seen: Tensor) -> Tensor:
+        rgb, mask = seen[:, :3], seen[:, 3:]
+        return self.seen(torch.cat([rgb, rgb * mask, mask], 1) - 0.25)
+
+    def of_seen(self, seen: Tensor) -> Half:
+        """The half of crops [B, 4, 64, 64]."""
+        return self._half(self._seen(seen), 0)
+
+    def of_known(self, known: Tensor) -> Half:
+        """The half of known views [B, 4, 64, 64]."""
+        return self._half(self.known(known - 0.25), 1)
+
+    def halves(self, seen: Half, known: Half) -> Tensor:
+        """What `forward` says, up to rounding: the first layer is linear, so that it takes each half by itself, and
+        their difference."""
+        together = self._first((seen.maps - known.maps).abs(), 2, self._layer.bias) + seen.given + known.given
+        return self.both[1:](self.both[0][1:](together)).float()
+
+    def _half(self, maps: Tensor, number: int) -> Half:
+        return Half(maps, self._first(maps, number, None))
+
+    def _first(self, maps: Tensor, number: int, bias: Tensor | None) -> Tensor:
+        """The first layer, of the third with this number of its inputs."""
+        width = maps.shape[1]
+        weight = self._layer.weight[:, number * width:(number + 1) * width]
+        return F.conv2d(maps, weight, bias, self._layer.stride, self._layer.padding)
+
+    @property
+    def _layer(self) -> nn.Conv2d:
+        layer = self.both[0][0]
+        assert isinstance(layer, nn.Conv2d)
+        return layer
 
 
 class Compared:

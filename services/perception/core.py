@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -168,7 +169,7 @@ class Perception:
 
     def __init__(self, make: Callable[[tuple[str, ...]], Model], names: tuple[str, ...]):
         self._make = make
-        self._last: tuple[Frame, Seen] | None = None  # where the camera stands still, nothing is inferred twice
+        self._last: tuple[Frame, Seen, list[Agreement | None]] | None = None  # nothing is inferred twice
         self.share(names)
 
     def share(self, names: tuple[str, ...]) -> None:
@@ -178,12 +179,13 @@ class Perception:
         """
         self.names, self.goal_told, self._last = names, False, None
         self.same_view: SameView | None = None  # which compares images with the goal image
-        self.model = self._make(names) if names else None
-        self.features = LocalFeatures() if isinstance(self.model, SceneCCN) else None  # others compare by themselves
+        self.model = model = self._make(names) if names else None
+        # Other models tell by themselves how an object is turned.
+        self._compare = partial(SameView, LocalFeatures(), model.sides_m) if isinstance(model, SceneCCN) else None
 
     def begin(self, run: str, episode: int) -> Iterable[Output]:
-        """Starts an episode. Percepts depend on one image alone, so there is nothing else to reset."""
-        self.goal_told, self.same_view = False, None
+        """Starts an episode. Percepts depend on one image and the goal image alone."""
+        self.goal_told, self.same_view, self._last = False, None, None
         return ()
 
     def step(self, inputs: Inputs) -> Iterable[Output]:
@@ -195,27 +197,26 @@ class Perception:
         if not self.goal_told:
             self.goal_told = True
             yield from self._goal(model, inputs["goal"])
-        seen = self._seen(model, frame)
+        seen, agreements = self._seen(model, frame)
         for k, name in enumerate(self.names):
-            told, *further = [self._told(k, row, frame, seen) for row in seen.rows_of(k)]
+            told, *further = [self._told(name, row, frame, seen, agreements[row]) for row in seen.rows_of(k)]
             yield Output(PERCEPT, replace(told, further=further) if further else told, name)
 
-    def _told(self, k: int, row: int, frame: Frame, seen: Seen) -> Percept:
-        """The percept of a row of what was seen, which is of object `k`."""
-        told = percept(frame, self.names[k], seen, row, frame.world_from_camera)
-        agrees = self._agreement(k, row, frame, seen)
+    def _told(self, name: str, row: int, frame: Frame, seen: Seen, agrees: Agreement | None) -> Percept:
+        """The percept of a row of what was seen, and how it agrees with the goal image."""
+        told = percept(frame, name, seen, row, frame.world_from_camera)
         return told if agrees is None else replace(told, goal_agreement=agrees.share, goal_aside_rad=agrees.aside_rad)
 
-    def _agreement(self, k: int, row: int, frame: Frame, seen: Seen) -> Agreement | None:
-        if self.same_view is None:
-            return None
-        return self.same_view(k, frame.rgb, frame.intrinsics_px, frame.world_from_camera[2, :3], seen, row)
-
-    def _seen(self, model: Model, frame: Frame) -> Seen:
+    def _seen(self, model: Model, frame: Frame) -> tuple[Seen, list[Agreement | None]]:
+        """What is seen in the frame, and how each row of it agrees with the goal image, if they are compared."""
         if self._last is None or not _same_view(self._last[0], frame):
             up = frame.world_from_camera[2, :3]
-            self._last = frame, model.see(frame.rgb, frame.intrinsics_px, up, frame.depth_m)
-        return self._last[1]
+            seen = model.see(frame.rgb, frame.intrinsics_px, up, frame.depth_m)
+            compare, kinds = self.same_view, (*range(len(self.names)), *seen.kinds)
+            self._last = frame, seen, [
+                None if compare is None else compare(k, frame.rgb, frame.intrinsics_px, up, seen, row)
+                for row, k in enumerate(kinds)]
+        return self._last[1:]
 
     def _goal(self, model: Model, goal: Goal) -> Iterable[Output]:
         """The percepts of the goal image. Without a goal image the presence of every object is 0. Of several of a kind
@@ -228,10 +229,9 @@ class Perception:
             seen.presence[:] = 0.0
         else:
             seen = model.see(goal.rgb, goal.intrinsics_px, GOAL_UP, alone=True)
-            if isinstance(model, SceneCCN) and self.features is not None:
+            if self._compare is not None:
                 rows = [seen.goal_row(k, middle) for k in range(len(self.names))]
-                self.same_view = SameView(self.features, model.sides_m, goal.rgb, goal.intrinsics_px, GOAL_UP, seen,
-                                          rows)
+                self.same_view = self._compare(goal.rgb, goal.intrinsics_px, GOAL_UP, seen, rows)
         for k, name in enumerate(self.names):
             yield Output(GOAL_PERCEPT, percept(goal, name, seen, seen.goal_row(k, middle), np.eye(4)), name)
 

@@ -23,11 +23,15 @@ class Cropper:
 
     def __init__(self, image: Tensor, masks: Tensor, intrinsics_px: ArrayLike, up: ArrayLike):
         self.size = np.array([image.shape[-1], image.shape[-2]])  # width and height
-        self.pyramid = [image[None]]
-        for _ in range(_LEVELS - 1):
-            self.pyramid.append(F.avg_pool2d(self.pyramid[-1], 2))
+        self._pyramid = [image[None]]
         self.masks, self.up = masks, np.asarray(up, dtype=np.float64)
         self.intrinsics_px = np.asarray(intrinsics_px, dtype=np.float64)
+
+    def _level(self, level: int) -> Tensor:
+        """A level of the image's pyramid [1, 3, h, w], which is made when it is needed."""
+        while len(self._pyramid) <= level:
+            self._pyramid.append(F.avg_pool2d(self._pyramid[-1], 2))
+        return self._pyramid[level]
 
     def cut(self, window: Window) -> tuple[Tensor, Tensor]:
         """Crops [K, 3, 64, 64] and their masks [K, 1, 64, 64]. Outside the image the crop is black and the mask 0."""
@@ -35,7 +39,7 @@ class Cropper:
         crops = torch.empty(len(grid), 3, CROP_PX, CROP_PX)
         for level in np.unique(levels):
             rows = torch.as_tensor(np.flatnonzero(levels == level))
-            source = self.pyramid[level].expand(len(rows), -1, -1, -1)
+            source = self._level(level).expand(len(rows), -1, -1, -1)
             crops[rows] = F.avg_pool2d(F.grid_sample(source, grid[rows], align_corners=False), 2)
         masks = F.grid_sample(self.masks[:, None], grid, align_corners=False)
         return crops, F.avg_pool2d(masks, 2)
@@ -50,7 +54,7 @@ class Cropper:
         return self._fine(grid, levels), F.grid_sample(self.masks[:, None], grid, align_corners=False)[:, 0]
 
     def _fine(self, grid: Tensor, levels: NDArray[np.int64]) -> Tensor:
-        crops = [F.grid_sample(self.pyramid[level], each[None], mode="bicubic", padding_mode="border",
+        crops = [F.grid_sample(self._level(level), each[None], mode="bicubic", padding_mode="border",
                                align_corners=False) for level, each in zip(levels, grid, strict=True)]
         return torch.cat(crops).clamp(0.0, 1.0)
 

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from saccade.services.perception.local_features import Features, mutual
@@ -58,27 +57,25 @@ class LandmarkFit:
 
     def __init__(self, landmarks: Landmarks):
         self.points_m = landmarks.points_m.astype(np.float64)
-        self.descriptors = torch.from_numpy(landmarks.descriptors)
+        self.descriptors = landmarks.descriptors
         directions, seen = landmarks.directions, landmarks.seen
         self.apart = directions @ directions.T < np.cos(APART_RAD)  # [SIDES, SIDES]
-        self.around = torch.from_numpy(directions @ directions.T > np.cos(NEAR_RAD)).float() @ \
-            torch.from_numpy(seen).float() > 0  # [SIDES, N]: the landmarks that are seen from near a side
+        near = (directions @ directions.T > np.cos(NEAR_RAD)).astype(np.float32)
+        self.around = near @ seen.astype(np.float32) > 0  # [SIDES, N]: the landmarks that are seen from near a side
         self.towards = seen.T @ directions  # [N, 3]: from where a landmark is seen, not of unit length
         self.radius_m = float(np.linalg.norm(landmarks.points_m, axis=1).max(initial=0.0))
 
-    @torch.inference_mode()
     def votes(self, found: Features) -> float:
         """How much speaks for the object, seen from one side: a quick measure to choose what is worth a fit."""
-        alike = found.descriptors[:VOTING_FEATURES] @ self.descriptors[:VOTING_LANDMARKS].T
+        alike = found.descriptors[:VOTING_FEATURES].numpy() @ self.descriptors[:VOTING_LANDMARKS].T
         rows, which = mutual(alike)
-        return float((self.around[:, which] * (alike[rows, which] - VOTE).clamp(min=0.0)).sum(1).max())
+        return float((self.around[:, which] * np.maximum(alike[rows, which] - VOTE, 0.0)).sum(1).max())
 
-    @torch.inference_mode()
     def __call__(self, found: Features, focal_px: float, side_px: int, *, quick: bool = False) -> Fit | None:
         """The pose that most landmarks agree on, or None if too few do. The features are those of a square crop of
         `side_px` whose camera has the focal length `focal_px`. A quick fit looks at the surest of both."""
         features, landmarks = (QUICK_FEATURES, QUICK_LANDMARKS) if quick else (None, None)
-        alike = found.descriptors[:features] @ self.descriptors[:landmarks].T
+        alike = found.descriptors[:features].numpy() @ self.descriptors[:landmarks].T
         if min(alike.shape) < FEWEST:
             return None
         around = self.around[:, :landmarks]
@@ -86,10 +83,10 @@ class LandmarkFit:
         camera = {"model": "SIMPLE_PINHOLE", "width": side_px, "height": side_px,
                   "params": [focal_px, side_px / 2, side_px / 2]}
         best: tuple[Fit, Array, NDArray[np.int64]] | None = None
-        for side in self._tried(votes.numpy(), QUICK_SIDES if quick else SIDES_TRIED):
-            near = torch.nonzero(around[side])[:, 0]
-            rows, which = mutual(alike[:, near])
-            pixels, shown = found.pixels[rows].double().numpy(), near[which].numpy()
+        for side in self._tried(votes, QUICK_SIDES if quick else SIDES_TRIED):
+            near = np.flatnonzero(around[side])
+            rows, which = mutual(alike.take(near, axis=1))
+            pixels, shown = found.pixels.numpy()[rows].astype(np.float64), near[which]
             fit = self._fit(pixels, shown, camera)
             if fit and (best is None or fit.inliers > best[0].inliers):
                 best = fit, pixels, shown

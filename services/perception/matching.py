@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
 
 from saccade.services.perception.landmark_fit import Fit
 from saccade.services.perception.things import Match
@@ -18,9 +17,9 @@ FOUND = 0.5  # chosen: presence from which on an object counts as found in a thi
 LESS = 0.15  # chosen: of a similarity; one more of an object is not less like it by more than this
 
 
-def best_matches(count: int, pairs: Sequence[tuple[int, int, int]], log_odds: NDArray[np.float64],
-                 fits: Mapping[tuple[int, int], Fit]) -> list[Match]:
-    """Where each of `count` objects is likeliest, by pairs (object, thing, view). A thing is one object, or none of
+def best_matches(pairs: Sequence[tuple[int, int, int]], log_odds: NDArray[np.float64],
+                 fits: Mapping[tuple[int, int], Fit]) -> dict[int, Match]:
+    """Where each object is likeliest, of those in the pairs (object, thing, view). A thing is one object, or none of
     them: `log_odds` are those against none. Where an object is sure to be in several things, as in the whole image and
     in a part of it, landmarks decide."""
     odds = np.exp(np.clip(log_odds, -30, 30))
@@ -31,26 +30,24 @@ def best_matches(count: int, pairs: Sequence[tuple[int, int, int]], log_odds: ND
     total: dict[int, float] = {}
     for (_, thing), row in best.items():
         total[thing] = total.get(thing, 1.0) + float(odds[row])
-    matches = []
-    for k in range(count):
+    matches = {}
+    for k in sorted({k for k, _ in best}):
         seen = [(float(odds[r]) / total[t], t, r) for (o, t), r in best.items() if o == k]
         support = {t: fits[k, t].support if (k, t) in fits else 0.0 for _, t, _ in seen}
         presence, thing, row = max(seen, key=lambda each: (min(each[0], SURELY), support[each[1]], each[0]))
-        matches.append(Match(thing, presence, pairs[row][2], row, fits.get((k, thing))))
+        matches[k] = Match(thing, presence, pairs[row][2], row, fits.get((k, thing)))
     return matches
 
 
-def unclaimed(similar: Sequence[Tensor], matches: Sequence[Match], *, whole: bool) -> list[tuple[int, int]]:
-    """The things in which no object was found and what they may be: (object, thing). By the similarities [P, V] to its
-    views a thing is nearly as like an object that was found as what it was found in. The last thing may be the `whole`
+def unclaimed(like: NDArray[np.float64], matches: Mapping[int, Match], *, whole: bool) -> list[tuple[int, int]]:
+    """The things in which no object was found and what they may be: (object, thing). By its likeness to the objects
+    [K, P] a thing is nearly as like an object that was found as what it was found in. The last thing may be the `whole`
     image."""
-    taken = {match.thing for match in matches if match.presence >= FOUND}
-    count = len(similar[0]) - whole
-    likeness = np.array([each.max(1).values.numpy() for each in similar])  # [K, P]
+    taken = {match.thing for match in matches.values() if match.presence >= FOUND}
     pairs = []
-    for thing in sorted(set(range(count)) - taken):
-        mine = [k for k, match in enumerate(matches) if match.presence >= FOUND
-                and likeness[k, thing] > likeness[k, match.thing] - LESS]
+    for thing in sorted(set(range(like.shape[1] - whole)) - taken):
+        mine = [k for k, match in matches.items() if match.presence >= FOUND
+                and like[k, thing] > like[k, match.thing] - LESS]
         pairs += [(k, thing) for k in mine]
     return pairs
 

@@ -17,7 +17,7 @@ import torch.nn.functional as F
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from saccade.services.perception.comparer import Compared, Comparison
+from saccade.services.perception.comparer import Compared, Comparison, Half
 from saccade.services.perception.cropping import Cropper
 from saccade.services.perception.landmark_fit import FEATURES, Fit, LandmarkFit
 from saccade.services.perception.landmark_search import Found, LandmarkSearch
@@ -42,7 +42,10 @@ MASK_PX = 60
 NEAR = 0.3  # of the image that things fill, from which on one may be nearer than the image is large
 CERTAIN = 25  # landmarks; where so many speak for what a thing is, it is nothing else
 TWINS = 0.1  # of a similarity: an object that is nearly as like may be a twin of what was found
-KEPT = 500  # pictures that are kept unpacked, of 16 kB each
+LIKEST = 2  # objects that a thing is likest, which are looked for in it where one image follows another, beside twins
+LIKE_NOTHING = 0.1  # a normalised similarity; to a thing that is less like everything nothing is fitted there
+ABSENT = 5e-3  # the presence of an object that no thing is among the likest of
+KEPT = 200  # views that are kept as the comparison takes them, of 200 kB each
 SHARPNESS = 20.0  # of the similarities, where it is told how an object is turned
 LIKE_SOMETHING = 0.23  # a normalised similarity; a thing that is less like everything is rolled
 ROLLS_RAD = 2 * np.pi / 8 * np.arange(8)  # in which a thing is tried that is like nothing as it stands
@@ -84,15 +87,17 @@ class OpenWorld:
 
     def __init__(self, proposer: Proposer, encoder: ViewEncoder, comparison: Comparison, features: LocalFeatures,
                  banks: list[Bank], cohort: Cohort, log_odds: LogOdds = USUAL):
-        self.proposer, self.encoder, self.comparison = proposer.eval(), encoder.eval(), comparison.eval()
+        self.proposer, self.encoder, self.comparison = (  # in this order of memory they take less time
+            network.eval().to(memory_format=torch.channels_last) for network in (proposer, encoder, comparison))
         self.banks, self.log_odds = banks, log_odds
-        self.vectors = [torch.from_numpy(bank.vectors) for bank in banks]
+        self.vectors = torch.from_numpy(np.concatenate([bank.vectors for bank in banks]))
+        self.directions = [bank.directions for bank in banks]
         self.features, self.cohort = features, cohort
         self.fits = [LandmarkFit(bank.landmarks) for bank in banks]
         self.search = LandmarkSearch(features, self.fits)
         self.many = float(np.log(max(len(banks) / OBJECTS, 1.0)))  # a thing is each of many more seldom
-        self.likest = [cohort.likest(vectors) for vectors in self.vectors]
-        self._image = lru_cache(KEPT)(lambda k, view: banks[k].image(view))  # an agent sees the same views again
+        self.likest = cohort.likest(self.vectors)
+        self._known = lru_cache(KEPT)(self._of_view)  # an agent sees the same views again
 
     @torch.inference_mode()
     def see(self, rgb: NDArray[np.uint8], intrinsics_px: ArrayLike, up: ArrayLike,
@@ -103,31 +108,36 @@ class OpenWorld:
         count = len(self.banks)
         found = self.search(things, ROLLS_RAD.tolist()) if alone else {}
         things, similar = self.rolled_things(things, found)
-        pairs = [pair for k in range(count) for pair in self._candidates(k, similar[k], found, whole=things.whole)]
-        first = self._round(things, similar, pairs, found, quick=not alone)
-        matches = best_matches(count, first.pairs, first.log_odds, first.fits)
-        told = [(k, match, first) for k, match in enumerate(matches)]
-        more = [(k, thing, view) for k, thing in unclaimed(similar, matches, whole=things.whole)
+        like = _likeness(similar)
+        worth = np.ones_like(like, dtype=bool) if alone else _worth_a_look(like)
+        pairs = [pair for k in range(count)
+                 for pair in self._candidates(k, similar[k], found, worth[k], whole=things.whole)]
+        first = self._round(things, similar, like, pairs, found, quick=not alone)
+        matches = best_matches(first.pairs, first.log_odds, first.fits)
+        told = [(k, k, match, first) for k, match in matches.items()]  # of no other object anything is told
+        more = [(k, thing, view) for k, thing in unclaimed(like, matches, whole=things.whole)
                 for view in self._views(k, similar[k][thing])]
+        kinds: list[int] = []
         if more:
-            second = self._round(things, similar, more, found, quick=not alone)
+            second = self._round(things, similar, like, more, found, quick=not alone)
             odds = np.exp(np.clip(second.log_odds, -30, 30))
-            told += [(k, match, second) for k, match in further_matches(second.pairs, odds, second.fits)]
-        seen = _nothing(len(told), rgb.shape)
+            further = further_matches(second.pairs, odds, second.fits)
+            kinds = [k for k, _ in further]
+            told += [(count + n, k, match, second) for n, (k, match) in enumerate(further)]
+        seen = _nothing(count + len(kinds), rgb.shape)
         masks = F.interpolate(things.masks[:, None], size=(MASK_PX, MASK_PX), mode="bilinear")[:, 0] > 0.5
-        for row, (k, match, compared) in enumerate(told):
+        for row, k, match, compared in told:
             placed = Placed(self.banks[k], match, compared.compared, things, intrinsics_px, up)
             self._tell(seen, row, k, match, placed, compared, similar[k][match.thing])
             seen.mask_bits[row] = bits(masks[match.thing, None].numpy())[0]
-        return replace(seen, kinds=tuple(k for k, _, _ in told[count:]))
+        return replace(seen, kinds=tuple(kinds))
 
-    def _round(self, things: Things, similar: list[Tensor], pairs: list[tuple[int, int, int]],
+    def _round(self, things: Things, similar: list[Tensor], like: Array, pairs: list[tuple[int, int, int]],
                found: Mapping[int, Found], *, quick: bool) -> Round:
         """Compares things with objects, pairs (object, thing, view): those that are worth it."""
-        fits = self.fitted(things, {(k, thing) for k, thing, _ in pairs}, found, similar, quick=quick)
-        pairs = _left(pairs, fits, similar)
-        known = torch.stack([self.view(k, view) for k, _, view in pairs])
-        compared = Compared(self.comparison(things.crops[[thing for _, thing, _ in pairs]], known))
+        fits = self.fitted(things, {(k, thing) for k, thing, _ in pairs}, found, like, quick=quick)
+        pairs = _left(pairs, fits, like)
+        compared = self._compared(things, pairs)
         alike = torch.stack([similar[k][thing, view] for k, thing, view in pairs])
         odds = self.log_odds(alike, compared.same, *self.found(pairs, fits)).double().numpy() - self.many
         return Round(pairs, compared, odds, fits)
@@ -149,9 +159,8 @@ class OpenWorld:
     def _similar(self, crops: Tensor) -> list[Tensor]:
         """The normalised similarities of crops [P, 4, 64, 64] to the views of each object [P, V]."""
         vectors = self.encoder(crops)
-        mine = self.cohort.likest(vectors)
-        return [self.cohort.normalised(vectors @ bank.T, mine, likest)
-                for bank, likest in zip(self.vectors, self.likest, strict=True)]
+        every = self.cohort.normalised(vectors @ self.vectors.T, self.cohort.likest(vectors), self.likest)
+        return list(every.split([len(bank.vectors) for bank in self.banks], dim=1))
 
     def rolled_things(self, things: Things, found: Mapping[int, Found] | None = None) -> tuple[Things, list[Tensor]]:
         """Things, each rolled as it was found, or else so that it is most like something; and their similarities to the
@@ -187,19 +196,21 @@ class OpenWorld:
 
     @torch.inference_mode()
     def fitted(self, things: Things, pairs: Collection[tuple[int, int]],
-               found: Mapping[int, Found] | None = None, similar: Sequence[Tensor] | None = None, *,
+               found: Mapping[int, Found] | None = None, like: Array | None = None, *,
                quick: bool = True) -> dict[tuple[int, int], Fit]:
         """How the landmarks of objects fit things, for those of the `pairs` (object, thing) where enough do. What was
-        `found` is not fitted again. By the similarities to the objects' views, `similar`, the likest objects come
-        first, and where it is clear what a thing is, the others that are not nearly as like are left out."""
+        `found` is not fitted again. By the likenesses of the objects and things, `like` [K, P], the likest objects come
+        first, and where it is clear what a thing is, the others that are not nearly as like are left out. Where it must
+        be `quick`, so are things that are like nothing."""
         fits = {(each.object, thing): each.fit for thing, each in (found or {}).items()}
         left = sorted(set(pairs) - fits.keys())
-        if similar is not None:
-            left.sort(key=lambda pair: -_likeness(similar, *pair))
+        if like is not None:
+            left = [(k, thing) for k, thing in left if not quick or like[:, thing].max() > LIKE_NOTHING]
+            left.sort(key=lambda pair: -like[pair])
         wanted = sorted({thing for _, thing in left})
         seen = dict(zip(wanted, self.features(things.fine[wanted], FEATURES) if wanted else [], strict=True))
         for k, thing in left:
-            if similar is not None and not _may_be(k, thing, fits, similar):
+            if like is not None and not _may_be(k, thing, fits, like):
                 continue
             half = float(things.window.half_tangent[thing])
             fit = self.fits[k](seen[thing], FINE_PX / 2 / half, FINE_PX, quick=quick)
@@ -215,23 +226,35 @@ class OpenWorld:
 
     def view(self, k: int, view: int) -> Tensor:
         """A view of a bank [4, 64, 64] from 0 to 1."""
-        return torch.from_numpy(self._image(k, view)).permute(2, 0, 1).float() / 255.0
+        return torch.from_numpy(self.banks[k].image(view)).permute(2, 0, 1).float() / 255.0
 
-    def _candidates(self, k: int, similar: Tensor, found: Mapping[int, Found], *, whole: bool) -> \
-            list[tuple[int, int, int]]:
+    def _compared(self, things: Things, pairs: list[tuple[int, int, int]]) -> Compared:
+        """What the comparison says of the pairs (object, thing, view)."""
+        wanted = [thing for _, thing, _ in pairs]
+        seen, known = self.comparison.of_seen(things.crops), [self._known(k, view) for k, _, view in pairs]
+        return Compared(self.comparison.halves(Half(seen.maps[wanted], seen.given[wanted]),
+                                               Half(*(torch.cat(part) for part in zip(*known, strict=True)))))
+
+    def _of_view(self, k: int, view: int) -> Half:
+        """Each view by itself, so that it does not matter which ones are kept: rounding may depend on the batch."""
+        return self.comparison.of_known(self.view(k, view)[None].contiguous(memory_format=torch.channels_last))
+
+    def _candidates(self, k: int, similar: Tensor, found: Mapping[int, Found], worth: NDArray[np.bool_], *,
+                    whole: bool) -> list[tuple[int, int, int]]:
         """Which things are compared with object k, and with which of its views: (object, thing, view). Things are like
         it by `similar` [P, V], or it was found there, or they are the `whole` image, the last one: what is near fills
-        it."""
+        it. Only what is `worth` it [P] is compared."""
         likest = similar.max(1).values.topk(min(CANDIDATES, len(similar))).indices.tolist()
         pairs = []
         last = {len(similar) - 1} if whole else set()
         for thing in sorted({*likest, *last, *(n for n, each in found.items() if each.object == k)}):
-            pairs += [(k, thing, view) for view in self._views(k, similar[thing])]
+            if worth[thing]:
+                pairs += [(k, thing, view) for view in self._views(k, similar[thing])]
         return pairs
 
     def _views(self, k: int, similar: Tensor) -> list[int]:
         """The views of object k with which a thing is compared, by its similarities [V] to all of them."""
-        directions, left, views = self.banks[k].directions, similar.clone(), []
+        directions, left, views = self.directions[k], similar.clone(), []
         for _ in range(CANDIDATES):
             view = int(left.argmax())
             views.append(view)
@@ -273,21 +296,28 @@ class OpenWorld:
                       np.zeros(len(found)))
 
 
-def _likeness(similar: Sequence[Tensor], k: int, thing: int) -> float:
-    return float(similar[k][thing].max())
+def _likeness(similar: Sequence[Tensor]) -> Array:
+    """How like each object each thing is [K, P]."""
+    return np.array([each.max(1).values.numpy() for each in similar], dtype=np.float64)
 
 
-def _may_be(k: int, thing: int, fits: Mapping[tuple[int, int], Fit], similar: Sequence[Tensor]) -> bool:
+def _worth_a_look(like: Array) -> NDArray[np.bool_]:
+    """Which objects are looked for in which things [K, P], where one image follows another: those that a thing is
+    likest, or nearly as like."""
+    count, first = min(LIKEST, len(like)), like.max(0)
+    return (like >= np.sort(like, axis=0)[-count]) | (like > first - TWINS)
+
+
+def _may_be(k: int, thing: int, fits: Mapping[tuple[int, int], Fit], like: Array) -> bool:
     """Whether a thing may be object k, by what its landmarks say of other objects. Twins are nearly as like."""
     clear = [other for (other, where), fit in fits.items() if where == thing and fit.support >= CERTAIN]
-    return not clear or k in clear or any(
-        _likeness(similar, k, thing) > _likeness(similar, other, thing) - TWINS for other in clear)
+    return not clear or k in clear or any(like[k, thing] > like[other, thing] - TWINS for other in clear)
 
 
-def _left(pairs: list[tuple[int, int, int]], fits: Mapping[tuple[int, int], Fit], similar: Sequence[Tensor]) -> \
+def _left(pairs: list[tuple[int, int, int]], fits: Mapping[tuple[int, int], Fit], like: Array) -> \
         list[tuple[int, int, int]]:
     """The pairs (object, thing, view) that are worth a comparison, in their order: at least one of each object."""
-    left = {pair for pair in pairs if _may_be(pair[0], pair[1], fits, similar)}
+    left = {pair for pair in pairs if _may_be(pair[0], pair[1], fits, like)}
     told = {k for k, _, _ in left}
     first = {k: pair for pair in reversed(pairs) if (k := pair[0]) not in told}
     return [pair for pair in pairs if pair in left or first.get(pair[0]) == pair]
@@ -298,5 +328,5 @@ def _nothing(count: int, shape: tuple[int, ...]) -> Seen:
     height, width = shape[:2]
     none, empty = np.zeros((count, 0), dtype=np.float32), np.zeros((count, MASK_PX, MASK_PX), dtype=bool)
     middle = np.tile([width / 2, height / 2], (count, 1)).astype(np.float64)
-    return Seen(np.zeros(count), middle, np.full(count, float(width)), np.ones(count), np.ones(count), none, none,
-                np.zeros(count), bits(empty), np.tile(np.eye(4), (count, 1, 1)), [NOT_SEEN] * count)
+    return Seen(np.full(count, ABSENT), middle, np.full(count, float(width)), np.ones(count), np.ones(count), none,
+                none, np.zeros(count), bits(empty), np.tile(np.eye(4), (count, 1, 1)), [NOT_SEEN] * count)

@@ -78,7 +78,7 @@ class SameView:
         fewer = min(len(there.features.pixels), len(here.features.pixels))
         if fewer < FEWEST:
             return None
-        rows, columns = mutual(there.features.descriptors @ here.features.descriptors.T)
+        rows, columns = mutual((there.features.descriptors @ here.features.descriptors.T).numpy())
         count, affine = following(*((each.double().numpy() / SIDE_PX) for each in
                                     (there.features.pixels[rows], here.features.pixels[columns])))
         more = max(unlike(there.crop, here.crop, affine) - USUAL, 0.0) if count else 0.0

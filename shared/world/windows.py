@@ -42,12 +42,15 @@ class Window:
         """
         fx, fy, cx, cy = np.asarray(intrinsics_px, dtype=np.float64)
         rotation = upright(pixel_rays(self.pixels, intrinsics_px), up)
-        rays = _plane(side) * np.stack([self.half_tangent] * 2 + [np.ones(len(self.scales))], -1)[:, None]
-        rays = rays @ rotation.transpose(0, 2, 1)
-        ahead = -rays[..., 2]
-        safe = np.where(ahead > AHEAD, ahead, AHEAD)
-        pixel = np.stack([cx + fx * rays[..., 0] / safe, cy - fy * rays[..., 1] / safe], axis=-1)
-        return np.where((ahead > AHEAD)[..., None], pixel, NOWHERE_PX).reshape(len(rotation), side, side, 2)
+        axis = (np.arange(side) + 0.5) / side * 2 - 1
+        # The rays are (x h, -y h, -1), rotated. So each of their components is what the column x gives, and the row y.
+        columns = rotation[:, :, 0, None] * (self.half_tangent[:, None, None] * axis)  # [K, 3, side]
+        rows = rotation[:, :, 1, None] * (-self.half_tangent[:, None, None] * axis) - rotation[:, :, 2, None]
+        right, upward, back = columns[:, :, None, :].transpose(1, 0, 2, 3) + rows[:, :, :, None].transpose(1, 0, 2, 3)
+        share = 1.0 / np.maximum(-back, AHEAD)
+        pixel = np.stack([cx + fx * right * share, cy - fy * upward * share], axis=-1)
+        pixel[-back <= AHEAD] = NOWHERE_PX
+        return pixel
 
     def crop_of(self, pixels: ArrayLike, intrinsics_px: ArrayLike, up: ArrayLike) -> Array:
         """Returns where pixels (u, v) [N, 2] lie in each crop [K, N, 2]. This is the inverse of `pixels_of`.
