@@ -28,6 +28,7 @@ SERVICE = Service("belief", inputs=(PERCEPT, GOAL_PERCEPT, GOAL), trigger=PERCEP
 Moments = tuple[NDArray[np.float64], NDArray[np.float64]]  # mean [3], covariance [3, 3]
 
 WORTH_COMPARING = 0.05  # chosen: an object's pose is compared with the goal if its presence in the goal image is higher
+EVEN = 0.5  # chosen: prior probability that an object which the goal image does not show is in the scene
 LOCALISED_M = 0.08  # chosen: a view is used for the pose only if the deviation of the object's position is smaller
 
 
@@ -76,8 +77,10 @@ class BeliefFilter:
         percepts: dict[str, Percept] = inputs["percept"]
         if not self.goal_known:
             self.goal_known, place = True, place_of(inputs.get("goal"))
-            self.positions = {name: PositionFilter(self.config.belief, self._rng(0, f"start {name}"), place)
-                              for name in self.names}
+            self.positions = {
+                name: PositionFilter(self.config.belief, self._rng(0, f"start {name}"), place,
+                                     max(goal.presence, EVEN))  # what the goal image shows is there
+                for name, goal in ((name, inputs["goal_percept"][name]) for name in self.names)}
             self.goal_views = {
                 name: GoalView(self.config.belief, likeness, goal, self.symmetry[name])
                 for name, goal in inputs["goal_percept"].items() if goal.presence > WORTH_COMPARING
@@ -111,6 +114,7 @@ class BeliefFilter:
             position.seen(percept, rng)
         else:
             position.missed(visible, rng)
+            position.not_found(percept.world_from_camera, percept.intrinsics_px, others)
         change = self._notice(name, percept, name in present, others, rng)
         if change is not None:
             changes[name] = change
