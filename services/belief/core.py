@@ -28,7 +28,7 @@ SERVICE = Service("belief", inputs=(PERCEPT, GOAL_PERCEPT, GOAL), trigger=PERCEP
 Moments = tuple[NDArray[np.float64], NDArray[np.float64]]  # mean [3], covariance [3, 3]
 
 WORTH_COMPARING = 0.05  # chosen: an object's pose is compared with the goal if its presence in the goal image is higher
-EVEN = 0.5  # chosen: prior probability that an object which the goal image does not show is in the scene
+UNKNOWN, SHOWN = 0.5, 0.9  # chosen: prior probabilities that an object is there, and that one the goal image shows is
 LOCALISED_M = 0.08  # chosen: a view is used for the pose only if the deviation of the object's position is smaller
 
 
@@ -79,7 +79,7 @@ class BeliefFilter:
             self.goal_known, place = True, place_of(inputs.get("goal"))
             self.positions = {
                 name: PositionFilter(self.config.belief, self._rng(0, f"start {name}"), place,
-                                     max(goal.presence, EVEN))  # what the goal image shows is there
+                                     float(np.clip(goal.presence, UNKNOWN, SHOWN)))
                 for name, goal in ((name, inputs["goal_percept"][name]) for name in self.names)}
             self.goal_views = {
                 name: GoalView(self.config.belief, likeness, goal, self.symmetry[name])

@@ -197,6 +197,7 @@ class PositionFilter:
 
     def placed(self, mean: Array, covariance: Array, rng: np.random.Generator) -> None:
         """Draws all particles anew: the object is now believed at `mean` [3] (m), with this covariance [3, 3] (m^2)."""
+        self.unseen = None
         factor = np.linalg.cholesky(covariance + np.eye(3) * self.config.jitter_m ** 2)
         drawn = mean + rng.standard_normal(self.particles.shape) @ factor.T
         self.particles = np.clip(drawn, WORKSPACE_M[:, 0], WORKSPACE_M[:, 1])

@@ -1,4 +1,4 @@
-"""Whether an object that no image has shown yet may be there: the places where it could stand without having been seen."""
+"""Whether an object that no image has shown yet may be there: the places where it could stand unseen."""
 
 from __future__ import annotations
 
