@@ -42,6 +42,7 @@ from saccade.shared.world.place import Place, place_of
 SERVICE = Service("belief", inputs=(PERCEPT, GOAL_PERCEPT, GOAL), trigger=PERCEPT, outputs=(BELIEF, EVENTS))
 
 WORTH_COMPARING = 0.05  # chosen: an object's pose is compared with the goal if its presence in the goal image is higher
+UNKNOWN, SHOWN = 0.5, 0.9  # chosen: prior probabilities that an object is there, and that one the goal image shows is
 
 
 class BeliefFilter:
@@ -67,6 +68,7 @@ class BeliefFilter:
         self.episode, self.goal_known = episode, False
         self.place: Place | None = None
         self.goals: dict[str, tuple[Likeness, Percept]] = {}
+        self.prior: dict[str, float] = {}  # probability of each object to be there, before any image
         self.instances: dict[str, list[Instance]] = {}
         self.born = dict.fromkeys(self.names, 1)  # how many of each kind were found so far
         self.more: dict[str, Instance] = {}  # of kinds of which there were surely two: one more that was not seen yet
@@ -83,6 +85,8 @@ class BeliefFilter:
             self.goal_known, self.place = True, place_of(inputs.get("goal"))
             self.goals = {name: (likeness, goal) for name, goal in inputs["goal_percept"].items()
                           if goal.presence > WORTH_COMPARING for likeness in self._likeness(goal, self.place)}
+            self.prior = {name: float(np.clip(goal.presence, UNKNOWN, SHOWN))
+                          for name, goal in inputs["goal_percept"].items()}
             self.instances = {name: [self._instance(name, 1, self._rng(0, f"start {name}"))] for name in self.names}
         above = self.config.belief.present_above
         seen = {name: [p for p in percepts[name].each() if p.presence > above] for name in self.names}
@@ -109,7 +113,7 @@ class BeliefFilter:
         if name in self.goals:
             likeness, goal = self.goals[name]
             goal_view = GoalView(self.config.belief, likeness, goal, self.symmetry[name])
-        position = PositionFilter(self.config.belief, rng, self.place)
+        position = PositionFilter(self.config.belief, rng, self.place, self.prior[name])
         return Instance(self.kinds[name], number, self.config.belief, position, goal_view)
 
     def _update(self, name: str, percept: Percept, seen: dict[str, list[Percept]],

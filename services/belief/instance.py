@@ -80,6 +80,7 @@ class Instance:
             position.seen(percept, rng)
         else:
             position.missed(visible, rng)
+            position.not_found(percept.world_from_camera, percept.intrinsics_px, others)
         self.left, change = None, None
         if alone:
             change = self._notice(percept, seen, others, rng)

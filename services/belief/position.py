@@ -10,6 +10,7 @@ import numpy as np
 from filterpy.monte_carlo import systematic_resample
 from numpy.typing import NDArray
 
+from saccade.services.belief.unseen import Unseen
 from saccade.shared.bus.messages import Percept
 from saccade.shared.config import BeliefConfig
 from saccade.shared.world.geometry import IMAGE_SIZE_PX, REFERENCE_RANGE_M, pixel_rays, project
@@ -34,6 +35,7 @@ WHOLE, PART_M, PART_SHARE = 0.85, 0.04, 0.3
 WHOLE_SHARE = 0.5  # chosen: of the variance of evidence, which allows for parts that are seen
 OUTSIDE_M = 0.04  # chosen: a percept that is farther outside of the workspace than this is of a part, or wrong
 MARGIN_PX = 30  # chosen: an object nearer than this to the image's border is not expected to be seen
+HIDES = 0.5  # chosen: what is within this share of an object's radius of the line to its middle is wholly behind it
 CARRIED_M = 0.003  # chosen: deviation that a drifting object's position gains in a step
 UNSEEN = 1.5  # chosen: deviation of its speed, in units of the speed, while it is not seen
 ELSEWHERE = 0.5  # chosen: share of the particles of an object that is gone that are drawn anew anywhere
@@ -105,16 +107,20 @@ def _global_state(rng: np.random.Generator) -> Iterator[None]:
 class PositionFilter:
     """A particle filter over the position of one object: particles [N, 3] (m, world) and weights [N].
 
-    In a `place` that the goal message tells, objects are on its table, and its walls hide them.
+    In a `place` that the goal message tells, objects are on its table, and its walls hide them. `presence` is the prior
+    probability that the object is in the scene.
     """
 
-    def __init__(self, config: BeliefConfig, rng: np.random.Generator, place: Place | None = None):
+    def __init__(self, config: BeliefConfig, rng: np.random.Generator, place: Place | None = None,
+                 presence: float = 0.5):
         self.config, self.place = config, place
         self.extent_m = WORKSPACE_M if place is None else place.extent_m(WORKSPACE_M)
         self.volume_m3 = float(np.prod(self.extent_m[:, 1] - self.extent_m[:, 0]))
         self.particles = rng.uniform(self.extent_m[:, 0], self.extent_m[:, 1], (config.particles, 3))
         self.weights = np.full(config.particles, 1.0 / config.particles)
-        self.log_odds = 0.0  # log odds that the object is in the scene
+        self.prior = min(log_odds(presence), MOST_LOG_ODDS)
+        self.log_odds = self.prior  # log odds that the object is in the scene
+        self.unseen: Unseen | None = Unseen(self.extent_m)  # None once the object was seen
 
     @property
     def presence(self) -> float:
@@ -142,8 +148,9 @@ class PositionFilter:
         self.weights[fresh] = 1.0
         likelihood[fresh] = np.where(inside, born / self.volume_m3 / max(len(fresh), 1), 0.0)
         self._reweigh(likelihood, rng)
-        odds = percept.presence / max(1.0 - percept.presence, 1e-3)
-        self.log_odds = min(self.log_odds + np.log(max(odds, 1e-3)), MOST_LOG_ODDS)
+        if self.unseen is not None:  # that it is not elsewhere says nothing against its being here
+            self.log_odds, self.unseen = self.prior + self.unseen.log_overlooked(evidence.mean), None
+        self.log_odds = min(self.log_odds + log_odds(percept.presence), MOST_LOG_ODDS)
 
     def visible(self, camera: Array, intrinsics_px: Array, others: list[tuple[Evidence, float]]) -> NDArray[np.bool_]:
         """Which particles [N] are inside the image and not hidden by one of the `others` or by a wall.
@@ -152,11 +159,11 @@ class PositionFilter:
         """
         return self.clear(self.particles, camera, intrinsics_px, others)
 
-    def clear(self, points: Array, camera: Array, intrinsics_px: Array,
-              others: list[tuple[Evidence, float]]) -> NDArray[np.bool_]:
-        """The same of any points [N, 3] (m, world)."""
+    def clear(self, points: Array, camera: Array, intrinsics_px: Array, others: list[tuple[Evidence, float]],
+              margin_px: float = MARGIN_PX) -> NDArray[np.bool_]:
+        """The same of any points [N, 3] (m, world), at least `margin_px` from the image's border."""
         hide = behind if self.config.hidden == "outlines" else beyond_nearest
-        visible = in_view(points, camera, intrinsics_px) & ~hide(points, camera[:3, 3], others)
+        visible = in_view(points, camera, intrinsics_px, margin_px) & ~hide(points, camera[:3, 3], others)
         return visible if self.place is None else visible & ~self.place.hides(camera[:3, 3], points)
 
     def expected(self, visible: NDArray[np.bool_]) -> float:
@@ -173,6 +180,13 @@ class PositionFilter:
         unseen = max(1.0 - share * (1.0 - self.config.missed_weight), 1e-3)
         self.log_odds = max(self.log_odds + np.log(unseen), -MOST_LOG_ODDS)
 
+    def not_found(self, camera: Array, intrinsics_px: Array, others: list[tuple[Evidence, float]]) -> None:
+        """Updates the presence of an object that no image has shown so far. For the arguments see `visible`."""
+        if self.unseen is not None:
+            whole = [(evidence, HIDES * radius_m) for evidence, radius_m in others]
+            self.unseen.missed(self.clear(self.unseen.points, camera, intrinsics_px, whole, margin_px=0.0))
+            self.log_odds = self.prior + self.unseen.log_likelihood
+
     def carried(self, velocity_m: Array, seen: bool, rng: np.random.Generator) -> None:
         """Moves the particles as an object with this velocity [3] (metres a step) does in one step. If it was not
         `seen` in the last image, it may have stopped or turned back."""
@@ -183,6 +197,7 @@ class PositionFilter:
 
     def placed(self, mean: Array, covariance: Array, rng: np.random.Generator) -> None:
         """Draws all particles anew: the object is now believed at `mean` [3] (m), with this covariance [3, 3] (m^2)."""
+        self.unseen = None
         factor = np.linalg.cholesky(covariance + np.eye(3) * self.config.jitter_m ** 2)
         drawn = mean + rng.standard_normal(self.particles.shape) @ factor.T
         self.particles = np.clip(drawn, WORKSPACE_M[:, 0], WORKSPACE_M[:, 1])
@@ -218,16 +233,21 @@ class PositionFilter:
         return self.particles[np.minimum(np.searchsorted(np.cumsum(self.weights), places), len(self.weights) - 1)]
 
 
+def log_odds(probability: float) -> float:
+    """Log odds of a probability, finite also where it is 0 or 1."""
+    return float(np.log(max(probability / max(1.0 - probability, 1e-3), 1e-3)))
+
+
 def _density(points: Array, evidence: Evidence, factor: NDArray[np.floating]) -> Array:
     """Density of the evidence's Gaussian at points [N, 3], per cubic metre [N]; `factor` is its Cholesky factor."""
     whitened = np.linalg.solve(factor, (points - evidence.mean).T)
     return np.exp(-0.5 * (whitened ** 2).sum(0)) / ((2 * np.pi) ** 1.5 * np.prod(np.diag(factor)))
 
 
-def in_view(points: Array, camera: Array, intrinsics_px: Array) -> NDArray[np.bool_]:
-    """Which points [N, 3] are in front of the camera and inside the image, at least MARGIN_PX from its border."""
+def in_view(points: Array, camera: Array, intrinsics_px: Array, margin_px: float = MARGIN_PX) -> NDArray[np.bool_]:
+    """Which points [N, 3] are in front of the camera and inside the image, at least `margin_px` from its border."""
     pixels, depth = project(points, camera, intrinsics_px)
-    inside = (pixels > MARGIN_PX) & (pixels < IMAGE_SIZE_PX - MARGIN_PX)
+    inside = (pixels > margin_px) & (pixels < IMAGE_SIZE_PX - margin_px)
     return inside.all(-1) & (depth > NEAREST_M)
 
 
