@@ -288,9 +288,9 @@ def _likeness(similar: Sequence[Tensor]) -> Array:
 
 def _worth_a_look(like: Array) -> NDArray[np.bool_]:
     """Which objects are looked for in which things [K, P], where one image follows another: those that a thing is
-    likest, or nearly as like."""
+    likest, and twins of these where it is like something."""
     count, first = min(LIKEST, len(like)), like.max(0)
-    return (like >= np.sort(like, axis=0)[-count]) | (like > first - TWINS)
+    return (like >= np.sort(like, axis=0)[-count]) | ((like > first - TWINS) & (first > LIKE_SOMETHING))
 
 
 def _may_be(k: int, thing: int, fits: Mapping[tuple[int, int], Fit], like: Array) -> bool:
