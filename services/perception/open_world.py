@@ -22,7 +22,7 @@ from saccade.services.perception.cropping import Cropper
 from saccade.services.perception.landmark_fit import FEATURES, Fit, LandmarkFit
 from saccade.services.perception.landmark_search import Found, LandmarkSearch
 from saccade.services.perception.likeness import COHORT, OBJECTS, USUAL, Cohort, LogOdds
-from saccade.services.perception.local_features import LocalFeatures
+from saccade.services.perception.local_features import LocalFeatures, in_channels_last
 from saccade.services.perception.placed import Placed
 from saccade.services.perception.proposer import Proposals, Proposer, half_tangent, propose, with_whole
 from saccade.services.perception.seen import Modes, Seen, bits
@@ -77,8 +77,9 @@ class OpenWorld:
 
     def __init__(self, proposer: Proposer, encoder: ViewEncoder, comparison: Comparison, features: LocalFeatures,
                  banks: list[Bank], cohort: Cohort, log_odds: LogOdds = USUAL):
-        self.proposer, self.encoder, self.comparison = (  # in this order of memory they take less time
-            network.eval().to(memory_format=torch.channels_last) for network in (proposer, encoder, comparison))
+        self.proposer, self.encoder, self.comparison = proposer.eval(), encoder.eval(), comparison.eval()
+        for network in (proposer, encoder, comparison):
+            in_channels_last(network)
         self.banks, self.log_odds = banks, log_odds
         self.vectors = torch.from_numpy(np.concatenate([bank.vectors for bank in banks]))
         self.directions = [bank.directions for bank in banks]
