@@ -60,7 +60,7 @@ class Comparison(nn.Module):
         """What `forward` says, up to rounding: the first layer is linear, so that it takes each half by itself, and
         their difference."""
         together = self._first((seen.maps - known.maps).abs(), 2, self._layer.bias) + seen.given + known.given
-        return self.both[1:](self.both[0][1:](together)).float()
+        return self.both[1:](self._normed[1:](together)).float()
 
     def _half(self, maps: Tensor, number: int) -> Half:
         return Half(maps, self._first(maps, number, None))
@@ -72,8 +72,14 @@ class Comparison(nn.Module):
         return F.conv2d(maps, weight, bias, self._layer.stride, self._layer.padding)
 
     @property
+    def _normed(self) -> nn.Sequential:
+        first = self.both[0]
+        assert isinstance(first, nn.Sequential)
+        return first
+
+    @property
     def _layer(self) -> nn.Conv2d:
-        layer = self.both[0][0]
+        layer = self._normed[0]
         assert isinstance(layer, nn.Conv2d)
         return layer
 

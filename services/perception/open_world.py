@@ -22,7 +22,7 @@ from saccade.services.perception.cropping import Cropper
 from saccade.services.perception.landmark_fit import FEATURES, Fit, LandmarkFit
 from saccade.services.perception.landmark_search import Found, LandmarkSearch
 from saccade.services.perception.likeness import COHORT, OBJECTS, USUAL, Cohort, LogOdds
-from saccade.services.perception.local_features import LocalFeatures
+from saccade.services.perception.local_features import LocalFeatures, in_channels_last
 from saccade.services.perception.matching import best_matches, further_matches, unclaimed
 from saccade.services.perception.placed import Placed
 from saccade.services.perception.proposer import Proposals, Proposer, half_tangent, propose, with_whole
@@ -87,8 +87,9 @@ class OpenWorld:
 
     def __init__(self, proposer: Proposer, encoder: ViewEncoder, comparison: Comparison, features: LocalFeatures,
                  banks: list[Bank], cohort: Cohort, log_odds: LogOdds = USUAL):
-        self.proposer, self.encoder, self.comparison = (  # in this order of memory they take less time
-            network.eval().to(memory_format=torch.channels_last) for network in (proposer, encoder, comparison))
+        self.proposer, self.encoder, self.comparison = proposer.eval(), encoder.eval(), comparison.eval()
+        for network in (proposer, encoder, comparison):
+            in_channels_last(network)
         self.banks, self.log_odds = banks, log_odds
         self.vectors = torch.from_numpy(np.concatenate([bank.vectors for bank in banks]))
         self.directions = [bank.directions for bank in banks]
@@ -303,9 +304,9 @@ def _likeness(similar: Sequence[Tensor]) -> Array:
 
 def _worth_a_look(like: Array) -> NDArray[np.bool_]:
     """Which objects are looked for in which things [K, P], where one image follows another: those that a thing is
-    likest, or nearly as like."""
+    likest, and twins of these where it is like something."""
     count, first = min(LIKEST, len(like)), like.max(0)
-    return (like >= np.sort(like, axis=0)[-count]) | (like > first - TWINS)
+    return (like >= np.sort(like, axis=0)[-count]) | ((like > first - TWINS) & (first > LIKE_SOMETHING))
 
 
 def _may_be(k: int, thing: int, fits: Mapping[tuple[int, int], Fit], like: Array) -> bool:
