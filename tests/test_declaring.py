@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from saccade.services.belief.pose import LatentLikeness
-from saccade.services.planner.core import build
-from saccade.services.planner.declaring import Evidence, Rivals, fused_here, together
-from saccade.shared.bus.messages import Belief, Percept
+from saccade.services.planner.core import SAID, build
+from saccade.services.planner.declaring import BESIDE, BESIDE_RAD, Evidence, Rivals, fused_here, together
+from saccade.shared.bus.messages import Belief, Percept, Plan
 from saccade.shared.config import Config
 from saccade.shared.world.geometry import INTRINSICS_PX, look_at, unit, viewing_grid, wrap
 from saccade.shared.world.symmetry import NONE
@@ -123,6 +123,38 @@ def test_the_planner_looks_from_the_rival_side_and_comes_back_to_say_that_it_is_
     assert not again.arrived
     assert unit(again.viewpoint[:3, 3] - CENTER) @ unit(FRONT[:3, 3] - CENTER) > 0.9
     assert plan_at(again.viewpoint, front, 0.7).arrived
+
+
+def said_at(until: str, steps: int) -> list[Plan]:
+    """The plans of a camera that goes to every viewpoint, and whose every view is like the goal's."""
+    planner = build(Config().with_values({"scene.names": [NAME], "planner.candidates": 30, "simulator.until": until}))
+    planner.begin("r", 0)
+    plans, camera = [], ASIDE
+    for step in range(steps):
+        said = belief(step, camera, posterior(front=0.9), 0.97)
+        plan, _ = (output.message for output in planner.step(
+            {"belief": {NAME: said}, "goal_percept": {NAME: goal_percept(NAME)}}))
+        plans.append(plan)
+        camera = plan.viewpoint
+    return plans
+
+
+def test_an_episode_that_goes_on_where_it_ends_at_the_goal_says_that_it_is_elsewhere():
+    """The agent looks from all around the view, from above first, and once it is through, from farther away. Where
+    an episode ends by its word, it stays."""
+    plans = said_at("reached", 40)
+    told = [k for k, plan in enumerate(plans) if plan.arrived]
+    assert told[:SAID - 1] == list(range(told[0], told[0] + SAID - 1))
+    front = unit(FRONT[:3, 3] - CENTER)
+    first = told[SAID - 2] + 1
+    ring = [unit(plan.viewpoint[:3, 3] - CENTER) for plan in plans[first:first + BESIDE]]
+    assert [float(np.arccos(towards @ front)) for towards in ring] == pytest.approx([BESIDE_RAD] * BESIDE, abs=0.1)
+    assert ring[0][2] == max(towards[2] for towards in ring)
+    back = unit(plans[first + BESIDE].viewpoint[:3, 3] - CENTER)
+    assert float(np.arccos(min(1.0, back @ front))) < 0.1
+    assert max(float(np.arccos(unit(p.viewpoint[:3, 3] - CENTER) @ front)) for p in plans[first + BESIDE:]) > 0.5
+    plans = said_at("declared", 20)
+    assert all(plan.arrived for plan in plans[told[0]:])
 
 
 class Still:

@@ -14,7 +14,7 @@ from saccade.services.belief.association import (
     DEAD_LOG_ODDS,
     LEFT_LOG_ODDS,
     LOST_M,
-    MORE_LOG_ODDS,
+    MORE,
     MOST,
     SAME,
     SURE,
@@ -68,7 +68,6 @@ class BeliefFilter:
         self.episode, self.goal_known = episode, False
         self.place: Place | None = None
         self.goals: dict[str, tuple[Likeness, Percept]] = {}
-        self.prior: dict[str, float] = {}  # probability of each object to be there, before any image
         self.instances: dict[str, list[Instance]] = {}
         self.born = dict.fromkeys(self.names, 1)  # how many of each kind were found so far
         self.more: dict[str, Instance] = {}  # of kinds of which there were surely two: one more that was not seen yet
@@ -85,9 +84,10 @@ class BeliefFilter:
             self.goal_known, self.place = True, place_of(inputs.get("goal"))
             self.goals = {name: (likeness, goal) for name, goal in inputs["goal_percept"].items()
                           if goal.presence > WORTH_COMPARING for likeness in self._likeness(goal, self.place)}
-            self.prior = {name: float(np.clip(goal.presence, UNKNOWN, SHOWN))
-                          for name, goal in inputs["goal_percept"].items()}
-            self.instances = {name: [self._instance(name, 1, self._rng(0, f"start {name}"))] for name in self.names}
+            self.instances = {
+                name: [self._instance(name, 1, self._rng(0, f"start {name}"),
+                                      float(np.clip(inputs["goal_percept"][name].presence, UNKNOWN, SHOWN)))]
+                for name in self.names}
         above = self.config.belief.present_above
         seen = {name: [p for p in percepts[name].each() if p.presence > above] for name in self.names}
         changes: list[tuple[Instance, Change]] = []
@@ -107,13 +107,13 @@ class BeliefFilter:
         direct = self.config.belief.pose != "last"  # the paper's agent has the transition alone
         return [LatentLikeness(self.transitions[goal.object], goal, direct=direct)] if len(goal.latent_mean) else []
 
-    def _instance(self, name: str, number: int, rng: np.random.Generator) -> Instance:
-        """A new instance of which nothing is known."""
+    def _instance(self, name: str, number: int, rng: np.random.Generator, prior: float = UNKNOWN) -> Instance:
+        """A new instance. Nothing is known of it but the `prior` probability that it is there."""
         goal_view = None
         if name in self.goals:
             likeness, goal = self.goals[name]
             goal_view = GoalView(self.config.belief, likeness, goal, self.symmetry[name])
-        position = PositionFilter(self.config.belief, rng, self.place, self.prior[name])
+        position = PositionFilter(self.config.belief, rng, self.place, prior)
         return Instance(self.kinds[name], number, self.config.belief, position, goal_view)
 
     def _update(self, name: str, percept: Percept, seen: dict[str, list[Percept]],
@@ -148,8 +148,8 @@ class BeliefFilter:
         number = self.born[name] + 1
         rng = self._rng(unseen.step, f"{name}#{number} unseen")
         if name not in self.more:
-            self.more[name] = self._instance(name, number, rng)
-            self.more[name].position.log_odds = MORE_LOG_ODDS
+            self.more[name] = self._instance(name, number, rng, MORE)
+            self.more[name].position.unseen = None  # where several are, one may well be at the table's edge
         self.more[name].number = number
         return [self._take(self.more[name], unseen, False, seen, rng, alone=False)[0]]
 

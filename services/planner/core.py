@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from saccade.services.planner.candidates import draw
-from saccade.services.planner.declaring import UNLIKELY, Evidence, fused_here
+from saccade.services.planner.declaring import UNLIKELY, Evidence, around, fused_here
 from saccade.services.planner.free_energy import Terms, expected_free_energy
 from saccade.services.planner.goal import Preference, infer_preference
 from saccade.services.planner.goal_views import Side, goal_eye, goal_viewpoint, heading
@@ -28,7 +28,7 @@ from saccade.shared.loop.seeding import generator
 from saccade.shared.loop.service import Inputs, Service
 from saccade.shared.model.object_card import symmetries
 from saccade.shared.model.weights import Weights
-from saccade.shared.world.geometry import Array, look_at, rotation_angle, rotation_towards
+from saccade.shared.world.geometry import Array, look_at, rotation_angle, rotation_towards, unit
 from saccade.shared.world.place import place_of
 from saccade.shared.world.symmetry import NONE
 from saccade.shared.world.task import Spheres, spheres_around, success
@@ -44,6 +44,7 @@ ARRIVED_RAD = 0.05  # chosen: the camera has arrived if it is within this angle 
 THERE_M = 0.04  # chosen: a view that was compared is the goal's if the goal's is believed to be within this of it
 STUCK_M = 0.002  # chosen: a camera that moves less than this in a step counts as arrived, because it cannot come nearer
 TURN_M = 0.10  # chosen: nearer than this to its viewpoint the camera turns as planned; before, it looks at the target
+SAID = 3  # chosen: steps for which the agent says that it is there before it takes the episode's going on for a no
 VISITED_M = 0.05  # chosen: viewpoints within about this distance of one that was not the goal's also become costly
 VISITED_RAD = 0.35  # chosen: viewpoints within about this angle of one that was not the goal's also become costly
 VISITED_COST = 6.0  # chosen: nats that are added to the cost of a viewpoint that was not the goal's
@@ -61,6 +62,8 @@ class Planner:
     def __init__(self, config: Config, names: tuple[str, ...]):
         self.config, self.names, self.symmetry = config, names, symmetries(config.scene.objects, names)
         self.moved_by = config.planner.moved_by or ("recording" if config.camera.source is not None else "agent")
+        self.ends_at_goal = (self.moved_by == "agent" and config.simulator.until == "reached"
+                             and config.scene.goal_image is None)
         self.sizes_m = {card.name: card.size_m for card in Weights(config.weights).cards_of(names)}
 
     def begin(self, run: str, episode: int) -> Iterable[Output]:
@@ -176,16 +179,36 @@ class Planner:
             target = beliefs[chosen.target]
             if not self.config.planner.retry:
                 declared = target.goal_here > SURE_ALONE
+            elif self.now.beside:
+                self.now.wanted = self.now.beside.pop(0)
             else:
                 evidence = self._evidence(target, camera)
                 self.now.is_near = evidence.is_enough
                 declared = evidence.is_enough and self._is_at(eye, camera, evidence)
-                if not self.now.is_near:
+                if declared and self._was_wrong():
+                    declared = self.now.is_near = False
+                    self._look_elsewhere(target, camera, evidence.look)
+                elif not self.now.is_near:
                     self._has_looked(target, camera, evidence.look, wrong=not evidence.is_beside and (
                         not evidence.rival or evidence.probability < UNLIKELY))
         self.age += 1
         due = chosen is None or arrived or mode != chosen.mode or self.age >= self._patience
         return due, declared
+
+    def _was_wrong(self) -> bool:
+        """Whether the agent has said often enough that it is there: where the world ends an episode at the goal, one
+        that goes on is not there."""
+        self.now.said += 1
+        return self.ends_at_goal and self.now.said % SAID == 0
+
+    def _look_elsewhere(self, target: Belief, camera: Array, look: float) -> None:
+        """Looks from all around a view that was like the goal's and was not it, once, and then from elsewhere. Where it
+        agrees best is believed to be the goal's view."""
+        if self.now.beside is None and look > UNLIKELY:
+            self.now.beside = [*around(unit(camera[:3, 3] - target.mean_m)), None]
+            self.now.wanted = self.now.beside.pop(0)
+        else:
+            self._has_looked(target, camera, look, wrong=True)
 
     @property
     def _patience(self) -> int:

@@ -23,6 +23,7 @@ UNLIKELY = 0.25  # chosen: a view that has a lower probability is not the goal's
 CLEAR = 0.93  # chosen: looks that are clearer than this need no look at rivals; a view that may be wrong reaches 0.95
 FLOOR = 0.02  # chosen: neither the looks nor the fused views count as surer than this leaves
 RIVAL = 0.25  # chosen: a direction with this probability around it is a rival of the likeliest one
+BESIDE, BESIDE_RAD = 6, 0.22  # chosen: from how many directions around a view the agent looks, and how far from it
 AROUND_RAD, APART_RAD = 0.4, 0.8  # chosen: what counts as around a direction, and how far rivals are from one another
 
 
@@ -74,6 +75,14 @@ def fused_here(target: Belief, camera: Array, symmetry: int) -> float:
         return 0.0
     share, rolled = np.exp(target.goal_log_posterior.astype(np.float64)), target.goal_rotations is not None
     return float(share[alike(camera[:3, 3], target.mean_m, symmetry, rolled=rolled)].sum() / share.sum())
+
+
+def around(towards: Array) -> list[Array]:
+    """Directions [3] around one: BESIDE_RAD from it, the one from higher up first."""
+    aside = unit(np.cross([0.0, 0.0, 1.0], towards) if np.hypot(*towards[:2]) > FLOOR else np.array([1.0, 0.0, 0.0]))
+    up = np.cross(towards, aside)
+    return [np.cos(BESIDE_RAD) * towards + np.sin(BESIDE_RAD) * (np.cos(angle) * up + np.sin(angle) * aside)
+            for angle in np.linspace(0.0, 2 * np.pi, BESIDE, endpoint=False)]
 
 
 class Rivals:

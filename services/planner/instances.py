@@ -26,6 +26,8 @@ class Tried:
     rivals: Rivals = field(default_factory=Rivals)
     wanted: Array | None = None  # the rival direction [3] from which the agent is about to look
     is_near: bool = False  # the goal's view is sure to be near, and the agent goes to where it is believed to be
+    said: int = 0  # steps in which the agent has said that it is there
+    beside: list[Array | None] | None = None  # directions [3] around such a view from which it will look; then back
     visited: list[Array] = field(default_factory=list)  # camera poses [4, 4] at which it arrived in the mode "goal"
 
 
