@@ -192,8 +192,10 @@ def test_every_short_field_of_every_message_has_a_value(tmp_path, topic):
     shown = decoded(tmp_path / "out.mcap")[name][0][1]
     for field, kind in kinds(topic.type).items():
         if not isinstance(kind, ArraySpec):
-            value = getattr(shown, field)
-            assert (list(value) if kind == list[str] else value) == getattr(message, field)
+            value, said = getattr(shown, field), getattr(message, field)
+            if field == "further":  # of further messages only the number is shown
+                said = len(said)
+            assert (list(value) if kind == list[str] else value) == said
         elif all(isinstance(side, int) for side in kind.shape):
             assert list(getattr(shown, field)) == getattr(message, field).ravel().tolist()
 

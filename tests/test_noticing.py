@@ -28,7 +28,8 @@ def truth(step, place, *, camera=CAMERA, in_view=1.0, done=False) -> Truth:
 
 def report(step, *objects) -> Events:
     return Events(**STAMP, step=step, objects=list(objects), kinds=["moved"] * len(objects),
-                  positions_m=np.zeros((len(objects), 3)), probabilities=np.ones(len(objects)))
+                  positions_m=np.zeros((len(objects), 3)), probabilities=np.ones(len(objects)),
+                  instances=np.ones(len(objects), dtype=np.uint8))
 
 
 def moved(at=3, count=20, **more):

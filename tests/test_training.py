@@ -60,7 +60,7 @@ def test_a_run_leaves_losses_pictures_and_weights_that_load(finished, tmp_path):
     export(finished, tmp_path / "weights")
     model = SceneCCN(Weights(tmp_path / "weights"), NAMES)
     seen = model.see(np.zeros((IMAGE_SIZE_PX, IMAGE_SIZE_PX, 3), np.uint8), INTRINSICS_PX, (0.0, 0.0, 1.0))
-    assert seen.latent_mean.shape == (2, 8)
+    assert seen.latent_mean.shape == (len(NAMES) + len(seen.kinds), 8)
 
 
 def test_the_crops_say_where_the_object_is(finished):

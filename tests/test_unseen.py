@@ -52,13 +52,12 @@ def test_what_may_be_hidden_is_not_ruled_out():
     assert near.presence > free.presence + 0.1
 
 
-def test_what_the_goal_image_shows_is_likely_there_until_the_table_says_otherwise():
-    position = filter_of(0.9)
-    look(position, look_at((0.6, 0.4, 0.3), (0.4, 0.4, 0.0)))
-    assert position.presence > 0.85
-    for _ in range(3):
-        look(position, FROM_ABOVE)
-    assert position.presence < 0.3
+def test_what_is_likely_before_any_image_stays_likelier():
+    positions = [filter_of(prior) for prior in (0.5, 0.9)]
+    for position in positions:
+        look(position, look_at((0.6, 0.0, 0.4), (0.25, 0.0, 0.0)))
+    odds = [position.presence / (1 - position.presence) for position in positions]
+    assert odds[1] / odds[0] == pytest.approx(9.0)
 
 
 def test_a_first_sight_counts_more_where_nobody_had_looked():

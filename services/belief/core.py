@@ -42,7 +42,6 @@ from saccade.shared.world.place import Place, place_of
 SERVICE = Service("belief", inputs=(PERCEPT, GOAL_PERCEPT, GOAL), trigger=PERCEPT, outputs=(BELIEF, EVENTS))
 
 WORTH_COMPARING = 0.05  # chosen: an object's pose is compared with the goal if its presence in the goal image is higher
-UNKNOWN, SHOWN = 0.5, 0.9  # chosen: prior probabilities that an object is there, and that one the goal image shows is
 
 
 class BeliefFilter:
@@ -84,10 +83,7 @@ class BeliefFilter:
             self.goal_known, self.place = True, place_of(inputs.get("goal"))
             self.goals = {name: (likeness, goal) for name, goal in inputs["goal_percept"].items()
                           if goal.presence > WORTH_COMPARING for likeness in self._likeness(goal, self.place)}
-            self.instances = {
-                name: [self._instance(name, 1, self._rng(0, f"start {name}"),
-                                      float(np.clip(inputs["goal_percept"][name].presence, UNKNOWN, SHOWN)))]
-                for name in self.names}
+            self.instances = {name: [self._instance(name, 1, self._rng(0, f"start {name}"))] for name in self.names}
         above = self.config.belief.present_above
         seen = {name: [p for p in percepts[name].each() if p.presence > above] for name in self.names}
         changes: list[tuple[Instance, Change]] = []
@@ -107,7 +103,7 @@ class BeliefFilter:
         direct = self.config.belief.pose != "last"  # the paper's agent has the transition alone
         return [LatentLikeness(self.transitions[goal.object], goal, direct=direct)] if len(goal.latent_mean) else []
 
-    def _instance(self, name: str, number: int, rng: np.random.Generator, prior: float = UNKNOWN) -> Instance:
+    def _instance(self, name: str, number: int, rng: np.random.Generator, prior: float = 0.5) -> Instance:
         """A new instance. Nothing is known of it but the `prior` probability that it is there."""
         goal_view = None
         if name in self.goals:
