@@ -9,7 +9,6 @@ landmarks in their banks are those of strangers.
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
@@ -34,6 +33,8 @@ from saccade.services.perception.open_world import OpenWorld
 from saccade.services.perception.placed import Placed
 from saccade.services.perception.proposer import Proposer
 from saccade.services.simulator.scenes import generate_scene
+from saccade.shared.errors import SaccadeError
+from saccade.shared.files import write_json
 from saccade.shared.model.bank import Bank
 from saccade.shared.model.weights import weights_in_use
 from saccade.shared.render.objects import load_mesh, names_in_use
@@ -153,7 +154,10 @@ def main() -> None:
         table.add_row(f"  {part}", f"{each:.1f}", f"{each / mean['sceneccn']:.2f}")
     Console().print(table)
     if options.out is not None:
-        options.out.write_text(json.dumps(results, indent=1) + "\n")
+        try:
+            write_json(options.out, results, "results")
+        except SaccadeError as error:
+            parser.exit(2, f"saccade: {error}\n")
 
 
 if __name__ == "__main__":

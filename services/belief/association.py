@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from saccade.services.belief.position import MODEL_STD_M, Evidence
+from saccade.services.belief.position import MODEL_STD_M, Evidence, Moments
 
 Array = NDArray[np.float64]
-Moments = tuple[Array, Array]  # mean [3], covariance [3, 3]
 
 LOG_BIRTH = float(np.log(0.01 / 0.5))  # chosen: log density of a new instance, per cubic metre of the workspace
 BIRTH_LOG_ODDS = 2.0  # chosen: by so much more than its percept's an instance's log odds are lower when it is born

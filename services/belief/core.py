@@ -25,10 +25,10 @@ from saccade.services.belief.association import (
     is_apart,
 )
 from saccade.services.belief.attitude import PoseLikeness
-from saccade.services.belief.instance import Instance, Kind, Moments, Others
+from saccade.services.belief.instance import Instance, Kind, Others
 from saccade.services.belief.motion import Change
 from saccade.services.belief.pose import GoalView, LatentLikeness, Likeness, TurnLikeness
-from saccade.services.belief.position import Evidence, PositionFilter, evidence_of, of_whole
+from saccade.services.belief.position import Evidence, Moments, PositionFilter, evidence_of, of_whole
 from saccade.shared.bus.messages import Belief, Events, Percept
 from saccade.shared.bus.topics import BELIEF, EVENTS, GOAL, GOAL_PERCEPT, PERCEPT, Output
 from saccade.shared.config import Config

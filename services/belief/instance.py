@@ -11,13 +11,12 @@ from saccade.services.belief.attitude import Views
 from saccade.services.belief.free_energy import crop_term, identity_term, likelihood_term, pose_term, position_term
 from saccade.services.belief.motion import Change, Motion
 from saccade.services.belief.pose import GoalView
-from saccade.services.belief.position import Evidence, PositionFilter, of_whole
+from saccade.services.belief.position import Evidence, Moments, PositionFilter, of_whole
 from saccade.shared.bus.messages import Belief, Percept
 from saccade.shared.config import BeliefConfig
 from saccade.shared.model.latent import LatentTransition
 from saccade.shared.wording import label_of
 
-Moments = tuple[NDArray[np.float64], NDArray[np.float64]]  # mean [3], covariance [3, 3]
 Others = list[tuple[Evidence, float]]  # what else is seen, with its radii (m)
 
 LOCALISED_M = 0.08  # chosen: a view is used for the pose only if the deviation of the object's position is smaller

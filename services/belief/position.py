@@ -17,6 +17,7 @@ from saccade.shared.world.geometry import IMAGE_SIZE_PX, REFERENCE_RANGE_M, pixe
 from saccade.shared.world.place import Place
 
 Array = NDArray[np.float64]
+Moments = tuple[Array, Array]  # mean [3] (m), covariance [3, 3] (m^2)
 
 WORKSPACE_M = np.array([[-0.5, 0.5], [-0.5, 0.5], [0.0, 0.5]])
 MODEL_STD_M = 0.006  # chosen: deviation of the box's centre from the centre of what is seen, which no network can know
@@ -221,8 +222,8 @@ class PositionFilter:
             self.particles = np.clip(self.particles[chosen] + noise, self.extent_m[:, 0], self.extent_m[:, 1])
             self.weights = np.full(len(weights), 1.0 / len(weights))
 
-    def moments(self) -> tuple[Array, Array]:
-        """Mean [3] (m) and covariance [3, 3] (m^2) of the particle cloud."""
+    def moments(self) -> Moments:
+        """Mean and covariance of the particle cloud."""
         mean = self.weights @ self.particles
         centred = self.particles - mean
         return mean, (centred * self.weights[:, None]).T @ centred

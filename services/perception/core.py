@@ -221,19 +221,16 @@ class Perception:
     def _goal(self, model: Model, goal: Goal) -> Iterable[Output]:
         """The percepts of the goal image. Without a goal image the presence of every object is 0. Of several of a kind
         the goal is the one in the middle."""
-        size = (480, 480) if goal.rgb is None else goal.rgb.shape[:2]
-        middle = np.array([size[1], size[0]]) / 2
-        if goal.rgb is None:
-            blank = np.zeros((480, 480, 3), dtype=np.uint8)
-            seen = model.see(blank, goal.intrinsics_px, GOAL_UP)
+        is_given = goal.rgb is not None
+        rgb = np.zeros((480, 480, 3), dtype=np.uint8) if goal.rgb is None else goal.rgb
+        seen = model.see(rgb, goal.intrinsics_px, GOAL_UP, alone=is_given)
+        if not is_given:
             seen.presence[:] = 0.0
-        else:
-            seen = model.see(goal.rgb, goal.intrinsics_px, GOAL_UP, alone=True)
-            if self._compare is not None:
-                rows = [seen.goal_row(k, middle) for k in range(len(self.names))]
-                self.same_view = self._compare(goal.rgb, goal.intrinsics_px, GOAL_UP, seen, rows)
-        for k, name in enumerate(self.names):
-            yield Output(GOAL_PERCEPT, percept(goal, name, seen, seen.goal_row(k, middle), np.eye(4)), name)
+        rows = [seen.goal_row(k, np.array(rgb.shape[1::-1]) / 2) for k in range(len(self.names))]
+        if is_given and self._compare is not None:
+            self.same_view = self._compare(rgb, goal.intrinsics_px, GOAL_UP, seen, rows)
+        for name, row in zip(self.names, rows, strict=True):
+            yield Output(GOAL_PERCEPT, percept(goal, name, seen, row, np.eye(4)), name)
 
 
 def _same_view(a: Frame, b: Frame) -> bool:

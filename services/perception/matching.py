@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from saccade.services.perception.landmark_fit import Fit
+from saccade.services.perception.seen import MOST
 from saccade.services.perception.things import Match
 
-MOST = 6  # of a kind in one image
 SURELY = 0.9  # the presence that counts as sure
 FOUND = 0.5  # chosen: presence from which on an object counts as found in a thing
 LESS = 0.15  # chosen: of a similarity; one more of an object is not less like it by more than this
@@ -23,10 +23,7 @@ def best_matches(pairs: Sequence[tuple[int, int, int]], log_odds: NDArray[np.flo
     them: `log_odds` are those against none. Where an object is sure to be in several things, as in the whole image and
     in a part of it, landmarks decide."""
     odds = np.exp(np.clip(log_odds, -30, 30))
-    best: dict[tuple[int, int], int] = {}  # the row of the likeliest view of each object in each thing
-    for row, (k, thing, _) in enumerate(pairs):
-        if (k, thing) not in best or odds[row] > odds[best[k, thing]]:
-            best[k, thing] = row
+    best = _likeliest_views(pairs, odds)
     total: dict[int, float] = {}
     for (_, thing), row in best.items():
         total[thing] = total.get(thing, 1.0) + float(odds[row])
@@ -37,6 +34,15 @@ def best_matches(pairs: Sequence[tuple[int, int, int]], log_odds: NDArray[np.flo
         presence, thing, row = max(seen, key=lambda each: (min(each[0], SURELY), support[each[1]], each[0]))
         matches[k] = Match(thing, presence, pairs[row][2], row, fits.get((k, thing)))
     return matches
+
+
+def _likeliest_views(pairs: Sequence[tuple[int, int, int]], odds: NDArray[np.float64]) -> dict[tuple[int, int], int]:
+    """The row of the likeliest view of each object in each thing."""
+    best: dict[tuple[int, int], int] = {}
+    for row, (k, thing, _) in enumerate(pairs):
+        if (k, thing) not in best or odds[row] > odds[best[k, thing]]:
+            best[k, thing] = row
+    return best
 
 
 def unclaimed(like: NDArray[np.float64], matches: Mapping[int, Match], *, whole: bool) -> list[tuple[int, int]]:
@@ -57,11 +63,9 @@ def further_matches(pairs: Sequence[tuple[int, int, int]], odds: NDArray[np.floa
     """The objects and where there is one more of each, the likeliest first, by the odds of pairs (object, thing, view)
     against none."""
     found: list[tuple[int, Match]] = []
-    for thing in sorted({thing for _, thing, _ in pairs}):
-        best: dict[int, int] = {}  # the row of the likeliest view of each object
-        for row, (k, where, _) in enumerate(pairs):
-            if where == thing and (k not in best or odds[row] > odds[best[k]]):
-                best[k] = row
+    views = _likeliest_views(pairs, odds)
+    for thing in sorted({thing for _, thing in views}):
+        best = {k: row for (k, where), row in views.items() if where == thing}
         k = max(best, key=lambda each: odds[best[each]])
         presence = float(odds[best[k]] / (1.0 + sum(odds[row] for row in best.values())))
         if presence >= FOUND:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+MOST = 6  # of a kind in one image
 LIKELY = 0.5  # chosen: of the presence of the likeliest one of a kind
 
 

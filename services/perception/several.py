@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from saccade.services.perception.networks import CELLS
+from saccade.services.perception.seen import MOST
 
-MOST = 6  # of a kind in one image
 VOTER = 0.3  # chosen: probability above which a cell that sees the object votes
 NEAR = 0.7  # chosen: votes belong to one object if they point to within this share of its radius
 FEWEST = 4.0  # chosen: cells that speak for an object where there are several
