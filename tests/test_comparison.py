@@ -75,6 +75,12 @@ def test_every_agent_of_the_paper_has_its_rows(tmp_path):
         cells(tmp_path, "ycb", ["nobody"])
 
 
+def test_how_lexa_learns_is_drawn_from_what_its_weights_say(tmp_path):
+    lines = comparison._learning("lexa", "ycb", tmp_path)
+    assert "20 at each point" in lines[2]
+    assert (tmp_path / "learning.png").stat().st_size > 5000
+
+
 # --- from the paper's agent to ours
 
 def test_the_steps_lead_from_the_papers_agent_to_ours_and_each_changes_something():

@@ -61,10 +61,13 @@ def test_training_continues_as_if_it_had_not_been_interrupted(finished):
     weights = Weights(finished / "weights")
     assert (weights.architecture, weights.names) == ("lexa", NAMES)
     weights.fill(Actor(), "lexa")  # what only training needs is not in them
-    measured = json.loads((finished / "weights" / MANIFEST).read_text())["losses"]["lexa"]
+    manifest = json.loads((finished / "weights" / MANIFEST).read_text())
+    measured = manifest["losses"]["lexa"]
     assert measured["environment_steps"] == 30 * 6  # two episodes before the first step of learning, then one a step
     assert measured["nearest"] > 0.0
     assert measured["reached"] in (0.0, 0.5, 1.0)
+    assert [row["environment_steps"] for row in manifest["measured"]] == [30 * 4, 30 * 6]  # at each checkpoint
+    assert manifest["measured"][-1] == {key: measured[key] for key in manifest["measured"][-1]}
 
 
 def test_the_goals_of_the_suite_are_neither_lived_in_nor_measured_on(tmp_path):

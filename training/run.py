@@ -142,6 +142,7 @@ def export(run_dir: Path, weights_dir: Path) -> None:
         losses[name], commits[name] = facts["losses"], facts["commit"]
         seconds += losses[name].get("seconds", 0.0)
     paper = config.architecture == "paper"
+    lived = {"measured": _measured(run_dir / "lexa")} if config.architecture == "lexa" else {}
     sizes = {name: load_mesh(config.objects, name).size_m for name in config.names}
     cards = tuple(ObjectCard(name, size, CROP_SIDE_M if paper else crop_side_m(size)) for name, size in sizes.items())
     data = f"{config.views} directions of each object of {config.objects!r}, from {{}}, composed"
@@ -151,7 +152,7 @@ def export(run_dir: Path, weights_dir: Path) -> None:
     write_weights(weights_dir, states, cards, {
         **({} if config.architecture == "default" else {"architecture": config.architecture}),
         **({"calibration": _calibration(config, losses)} if config.architecture in ("paper", "posecnn") else {}),
-        "data": described[config.architecture],
+        **lived, "data": described[config.architecture],
         "training": config.model_dump(mode="json"), "losses": losses, "commits": commits,
         "where_trained": _where(pick_device(config.device)), "seconds": round(seconds), "torch": torch.__version__})
 
@@ -191,6 +192,12 @@ def _calibration(config: TrainingConfig, losses: dict[str, dict]) -> dict[str, f
     pixel = {f"{name}.pixel_std": round(max(m["centre_px"] / 1.1774, 2.0), 2) for name, m in measured.items()}
     return pixel | {f"{name}.log_scale_std": round(max(m["log_scale"] / 0.6745, 0.02), 4)
                     for name, m in measured.items()}
+
+
+def _measured(folder: Path) -> list[dict[str, float]]:
+    """What was measured on goals at each checkpoint of a part of LEXA, against the environment steps until then."""
+    rows = [json.loads(line) for line in (folder / "losses.jsonl").read_text().splitlines()]
+    return [{key: row[key] for key in ("environment_steps", "goals", "reached", "nearest")} for row in rows]
 
 
 def _where(device: torch.device) -> str:

@@ -116,6 +116,25 @@ def draw_final_views(stories: Mapping[str, Sequence[Story]], out: Path) -> None:
     save(figure, out)
 
 
+def draw_learning(measured: Sequence[Mapping[str, float]], paper: tuple[float, float], out: Path) -> None:
+    """Draws how LEXA learns: the share of goals that it reaches (%), with Wilson's 95 % intervals, and the median of how
+    near it comes, against the environment steps that it has lived through. `paper` is the paper's (steps, %)."""
+    figure = new_figure((9.0, 3.6))
+    share, nearest = figure.subplots(1, 2)
+    steps = [row["environment_steps"] for row in measured]
+    reached = [wilson(round(row["reached"] * row["goals"]), round(row["goals"])) for row in measured]
+    bars = [[100 * (r.value - r.low) for r in reached], [100 * (r.high - r.value) for r in reached]]
+    share.errorbar(steps, [100 * r.value for r in reached], yerr=bars, fmt="o-", capsize=3, color=COLOURS[0],
+                   label="ours, goals that it never learns from")
+    share.plot(*paper, "*", color=COLOURS[1], markersize=10, label="the paper's")
+    share.set(xlabel="environment steps", ylabel="goals reached (%)", xscale="log", ylim=(0, None))
+    share.legend(fontsize=8)
+    nearest.plot(steps, [row["nearest"] for row in measured], "o-", color=COLOURS[0])
+    nearest.axhline(1.0, color="grey", linestyle=":")
+    nearest.set(xlabel="environment steps", ylabel="nearest to the goal, median (tolerances)", ylim=(0, None))
+    save(figure, out)
+
+
 @dataclass
 class Exploration:
     """An episode without a goal. `beliefs` holds what was believed about each object, by the number of views."""

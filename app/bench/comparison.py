@@ -15,7 +15,7 @@ from statistics import fmean
 from rich.console import Console
 
 from saccade.app.bench.bench import Plan, bench, differing, facts, prepare
-from saccade.app.bench.charts import draw_errors, draw_final_views
+from saccade.app.bench.charts import draw_errors, draw_final_views, draw_learning
 from saccade.app.bench.repeat import Results, prepare_again, read_results, replay
 from saccade.app.bench.table import MEASURES, PAPER_AGENTS, PAPER_ROOM, Row, milliseconds, rows, summarise
 from saccade.app.look.picture import Story
@@ -33,6 +33,7 @@ IN_THE_ROOM = ("lexa", "random-walk", "still")  # in the room only: one was trai
 PAPERS_NAMES = {"paper": "SceneCCN + AIF", "posecnn": "PoseCNN (uses depth)", "posecnn-infogain": "PoseCNN + Infogain"}
 PAPERS_ROOM = {"paper": "SceneCCN", "posecnn": "PoseCNN", "posecnn-infogain": "PoseCNN + Infogain",
                "lexa": "LEXA (about 7 M steps)"}
+PAPERS_STEPS = 7e6  # environment steps of the paper's LEXA
 GOALS_SHOWN = 10  # columns of the picture of final views
 PAGE, FOLDER = "table.md", "results"
 
@@ -108,6 +109,8 @@ def write_page(out: Path, found: dict[Cell, Results], scenes: dict[Cell, int], c
               "At the pace of these results, all scenes of this table take "
               f"{core_hours(found, scenes):.1f} hours of one core.", ""]
     room = {cell.agent: results for cell, results in found.items() if cell.suite == ROOM}
+    if "lexa" in room:
+        lines += [*_learning("lexa", room["lexa"].objects, out), ""]
     if room:
         draw_final_views(_final_views(room, console), out / "final_views.png")
         lines += ["## The views that were reached in the room", "",
@@ -169,6 +172,18 @@ def _training(agent: str, objects: str) -> str:
     manifest = Weights(_configuration(agent, objects).weights).manifest
     hours = f"{manifest['seconds'] / 3600:.1f}" if "seconds" in manifest else "unknown"
     return f"{manifest.get('data', 'unknown')}; {hours} hours on {manifest.get('where_trained', 'unknown')}"
+
+
+def _learning(agent: str, objects: str, out: Path) -> list[str]:
+    """How the agent that lives in the room learns, drawn from what its weights say."""
+    measured = Weights(_configuration(agent, objects).weights).manifest.get("measured")
+    if not measured:
+        return []
+    draw_learning(measured, (PAPERS_STEPS, PAPER_ROOM[PAPERS_ROOM[agent]]), out / "learning.png")
+    return [f"## How {agent} learns", "",
+            f"Goals of the room that it never learns from, and that are not the suite's: {measured[-1]['goals']:.0f} at "
+            "each point, with Wilson's 95 % intervals. A tolerance is what counts as success: 7.5 cm or 0.5 rad.", "",
+            "![Goals reached over environment steps, and how near it comes](learning.png)"]
 
 
 def _share(row: Row) -> str:

@@ -119,13 +119,13 @@ class LexaTask:
         """Does nothing, because this task has no weights that adapt."""
 
     def evaluate(self) -> dict[str, float]:
-        """How many steps it has lived through; what share of some goals the achiever reaches, none of which is of the
-        suite or learnt from; and the median of how near it comes, in tolerances."""
+        """How many steps it has lived through; how many goals were tried, none of which is of the suite or learnt from,
+        and what share of them the achiever reaches; and the median of how near it comes, in tolerances."""
         generator = generator_of(self.config, self.part, self.device, 2 ** 31)
         nearest = [self.room.reach(number, MEASURED_STEPS, lambda goal: Achieving(self.module, lambda: goal, generator))
                    for number in range(MEASURED)]
-        return {"environment_steps": float(self.replay.steps), "reached": float(np.mean(np.array(nearest) < 1.0)),
-                "nearest": float(np.median(nearest))}
+        return {"environment_steps": float(self.replay.steps), "goals": float(MEASURED),
+                "reached": float(np.mean(np.array(nearest) < 1.0)), "nearest": float(np.median(nearest))}
 
     @torch.no_grad()
     def draw(self, path: Path) -> None:
