@@ -54,17 +54,18 @@ def test_where_looks_from_both_sides_are_good_the_better_ones_decide():
 
 def test_a_view_that_was_compared_with_the_goal_image_counts_by_what_all_comparisons_leave():
     """The looks count no more, and beside a rival more is asked for."""
-    assert Evidence(0.1, 0.7, agreement=0.5).is_enough
+    assert Evidence(0.1, 0.85, agreement=0.5).is_enough
     assert not Evidence(0.99, 0.3, agreement=0.5).is_enough
     assert not Evidence(0.99, 0.99, agreement=0.3).is_enough
     assert not Evidence(0.99, 0.7, rival=True, agreement=0.5).is_enough
-    assert Evidence(0.1, 0.95, rival=True, elsewhere=0.9, agreement=0.5).is_enough
+    assert not Evidence(0.1, 0.95, rival=True, agreement=0.5).is_enough
+    assert Evidence(0.1, 0.95, rival=True, elsewhere=0.9, agreement=0.8).is_enough
 
 
 def test_a_view_that_agrees_in_part_is_not_given_up():
     """The goal's may be beside it. Another side agrees less."""
     assert Evidence(0.5, 0.3, agreement=0.35).is_beside
-    assert not Evidence(0.5, 0.3, agreement=0.25).is_beside
+    assert not Evidence(0.5, 0.3, agreement=0.15).is_beside
     assert not Evidence(0.5, 0.3).is_beside
 
 

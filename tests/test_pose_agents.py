@@ -216,6 +216,20 @@ def test_templates_find_how_an_object_is_turned():
     assert right >= 9
 
 
+def test_of_two_of_a_kind_each_has_its_pose():
+    names = ("cereal_box", "soup_can")
+    config, _ = configured(None, {"scene.names": list(names)}, [], "render-and-compare")
+    world = World(tuple(load_mesh("pantry", name) for name in names), further={"soup_can#2": "soup_can"})
+    height = world.meshes["soup_can"].size_m[2] / 2
+    centers = {"soup_can": np.array([0.0, 0.15, height]), "soup_can#2": np.array([0.0, -0.15, height])}
+    world.place({label: (center, 0.0) for label, center in centers.items()})
+    seen = TemplateMatcher(Weights(config.weights), "pantry", names, 2).see(
+        world.render(start_pose()), INTRINSICS_PX, start_pose()[2, :3])
+    told = [(start_pose() @ each)[:3, 3] for each in seen.camera_from_object]
+    assert seen.kinds == (1,)
+    assert sorted(told[row][1] for row in seen.rows_of(1)) == pytest.approx([-0.15, 0.15], abs=0.06)
+
+
 def test_who_renders_and_compares_runs_within_one_process_and_is_replayed(tmp_path):
     config, _ = configured(None, EPISODE | {"simulator.max_steps": 2, "bus.kind": "local"}, [], "render-and-compare")
     run(config, agent="render-and-compare", out=tmp_path / "r", plain=True, console=Console(file=io.StringIO()))

@@ -38,8 +38,8 @@ from saccade.shared.log.recording import RunLog
 from saccade.tests.fixtures.make import CONFIG, GOLDEN, IN_WORDS, WORDS, changes, in_words
 from saccade.tests.samples import sample
 
-FORMAT_1, FORMAT_2, FORMAT_3, FORMAT_4, FORMAT_5, FORMAT_6, FORMAT_7 = OLDER = tuple(
-    GOLDEN.with_name(f"format_{number}.mcap") for number in (1, 2, 3, 4, 5, 6, 7))
+FORMAT_1, FORMAT_2, FORMAT_3, FORMAT_4, FORMAT_5, FORMAT_6, FORMAT_7, _ = OLDER = tuple(
+    GOLDEN.with_name(f"format_{number}.mcap") for number in (1, 2, 3, 4, 5, 6, 7, 8))
 WAIT_S = 300
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from saccade.services.belief.looks import AROUND_RAD, Looks
+from saccade.services.belief.looks import WITHIN_RAD, Looks
 from saccade.services.perception.colours import unlike
 from saccade.services.perception.core import SceneCCN
 from saccade.services.perception.local_features import LocalFeatures
@@ -17,7 +17,6 @@ from saccade.shared.world.geometry import INTRINSICS_PX, direction, look_at, vie
 from saccade.shared.world.symmetry import NONE
 
 NAMES, CENTER = ("soup_can", "rice_box"), np.array([0.05, -0.05, 0.06])
-GOAL_UP = (0.0, 1.0, 0.0)
 
 
 def pairs(count=60):
@@ -45,17 +44,23 @@ def scene():
     world.close()
 
 
+def without_up(seen):
+    """What is known of a goal image."""
+    rgb, intrinsics_px, _, what = seen
+    return rgb, intrinsics_px, what
+
+
 def views(scene):
     """Looks at the rice box from a direction and a range, and says how well the view agrees with the goal image."""
     world, model = scene
     world.place({"rice_box": (CENTER, 0.0)}, (120, 90, 60))
 
-    def see(azimuth, elevation, range_m, aside_m=0.0, up=None):
+    def see(azimuth, elevation, range_m, aside_m=0.0):
         camera = look_at(CENTER + range_m * direction(azimuth, elevation), CENTER + np.array([0, 0, aside_m]))
-        rgb, up = world.render(camera), camera[2, :3] if up is None else up
+        rgb, up = world.render(camera), camera[2, :3]
         return rgb, INTRINSICS_PX, up, model.see(rgb, INTRINSICS_PX, up)
 
-    same = SameView(LocalFeatures(), model.sides_m, *see(0.4, 0.6, 0.4, up=GOAL_UP))
+    same = SameView(LocalFeatures(), model.sides_m, *without_up(see(0.4, 0.6, 0.4)))
     return lambda *at: same(NAMES.index("rice_box"), *see(*at)), same, see
 
 
@@ -69,7 +74,7 @@ def test_a_view_from_the_goals_direction_agrees_more_than_those_from_elsewhere(s
 def test_what_cannot_be_the_goals_view_is_not_compared(scene):
     """An object that is larger, elsewhere in the image, or not in the goal image."""
     agreement, same, see = views(scene)
-    assert agreement(0.4, 0.6, 0.65) is None
+    assert agreement(0.4, 0.6, 0.8) is None
     assert agreement(0.4, 0.6, 0.4, 0.15) is None
     assert same(NAMES.index("soup_can"), *see(0.4, 0.6, 0.4)) is None
 
@@ -91,9 +96,19 @@ def test_a_comparison_counts_for_its_own_direction_and_says_nothing_of_others():
     looks.take(at(-2.0), CENTER, 0.1, 1.0)
     assert ratio_at(looks, 1.0) > 4
     assert ratio_at(looks, -2.0) < -2
-    assert abs(ratio_at(looks, 1.0 + 5 * AROUND_RAD)) < 0.1
-    looks.take(at(1.01), CENTER, 0.2, 1.0)  # the last from one direction counts
-    assert ratio_at(looks, 1.0) < 0
+    assert abs(ratio_at(looks, 1.0 + 4 * WITHIN_RAD)) < 0.1
+    looks.take(at(1.01), CENTER, 0.1, 1.0)  # the last from one direction counts
+    assert ratio_at(looks, 1.0) < -2
+
+
+def test_a_view_that_agrees_in_part_speaks_against_its_own_direction_and_for_those_beside_it():
+    looks = Looks(NONE)
+    looks.take(at(1.0), CENTER, 0.3, 1.0, aside_rad=0.25)
+    assert ratio_at(looks, 1.25) > 2 > 0 > ratio_at(looks, 1.0) > ratio_at(looks, 0.95) - 1.0
+    assert ratio_at(looks, 1.25) > ratio_at(looks, 0.75) + 2  # it points there
+    up = Looks(NONE)
+    up.take(at(1.0), CENTER, 0.3, 1.0, above_rad=0.2)
+    assert ratio_at(up, 1.0, 0.8) > 2 > ratio_at(up, 1.0, 0.4)
 
 
 def test_what_a_comparison_says_of_a_symmetric_object_holds_wherever_it_looks_the_same():
@@ -113,19 +128,17 @@ def test_the_view_that_agrees_best_tells_the_goals_range():
 
 
 def test_a_view_from_beside_points_to_the_goals_direction():
-    """Also one that agrees in part, but not one that hardly agrees."""
-    looks, part, hardly = Looks(NONE), Looks(NONE), Looks(NONE)
-    looks.take(at(1.0), CENTER, 0.6, 1.0, aside_rad=-0.4)
-    part.take(at(1.0), CENTER, 0.3, 1.0, aside_rad=-0.4)
-    hardly.take(at(1.0), CENTER, 0.1, 1.0, aside_rad=-0.4)
-    assert ratio_at(looks, 0.6) > 3 * ratio_at(looks, 1.0)
-    assert ratio_at(part, 0.6) > 1 > ratio_at(part, 1.0)
-    assert abs(ratio_at(hardly, 0.6)) < 0.5
-    part.take(at(0.6), CENTER, 0.1, 1.0)  # what is seen there decides
-    assert ratio_at(part, 0.6) < -3
+    """But not one that hardly agrees; and what is seen there decides."""
+    part, hardly = Looks(NONE), Looks(NONE)
+    part.take(at(1.0), CENTER, 0.3, 1.0, aside_rad=-0.3)
+    hardly.take(at(1.0), CENTER, 0.1, 1.0, aside_rad=-0.3)
+    assert ratio_at(part, 0.7) > 1 > ratio_at(part, 1.0)
+    assert abs(ratio_at(hardly, 0.7)) < 0.5
+    part.take(at(0.7), CENTER, 0.05, 1.0)
+    assert ratio_at(part, 0.7) < -2.5
 
 
-@pytest.mark.parametrize("elevation", [1.3, 0.5])
+@pytest.mark.parametrize("elevation", [1.3, 0.6])
 def test_the_images_tell_which_way_around_the_object_the_goals_view_is(scene, elevation):
     """From above things are turned in the image, from the side their surface is shifted."""
     world, model = scene
@@ -136,7 +149,7 @@ def test_the_images_tell_which_way_around_the_object_the_goals_view_is(scene, el
         rgb = world.render(camera)
         return rgb, INTRINSICS_PX, camera[2, :3], model.see(rgb, INTRINSICS_PX, camera[2, :3])
 
-    same = SameView(LocalFeatures(), model.sides_m, *see(0.4))
+    same = SameView(LocalFeatures(), model.sides_m, *without_up(see(0.4)))
     for turned in (0.2, -0.2):
         aside_rad = same(NAMES.index("rice_box"), *see(0.4 + turned)).aside_rad
         assert 0.2 < -aside_rad / turned < 1.8

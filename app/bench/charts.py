@@ -117,8 +117,8 @@ def draw_final_views(stories: Mapping[str, Sequence[Story]], out: Path) -> None:
 
 
 def draw_learning(measured: Sequence[Mapping[str, float]], paper: tuple[float, float], out: Path) -> None:
-    """Draws how LEXA learns: the share of goals that it reaches (%), with Wilson's 95 % intervals, and the median of how
-    near it comes, against the environment steps that it has lived through. `paper` is the paper's (steps, %)."""
+    """Draws how LEXA learns, against the environment steps that it has lived through: the share of goals that it reaches
+    (%), with Wilson's 95 % intervals, and the median of how near it comes. `paper` is the paper's (steps, %)."""
     figure = new_figure((9.0, 3.6))
     share, nearest = figure.subplots(1, 2)
     steps = [row["environment_steps"] for row in measured]

@@ -181,8 +181,8 @@ def _learning(agent: str, objects: str, out: Path) -> list[str]:
         return []
     draw_learning(measured, (PAPERS_STEPS, PAPER_ROOM[PAPERS_ROOM[agent]]), out / "learning.png")
     return [f"## How {agent} learns", "",
-            f"Goals of the room that it never learns from, and that are not the suite's: {measured[-1]['goals']:.0f} at "
-            "each point, with Wilson's 95 % intervals. A tolerance is what counts as success: 7.5 cm or 0.5 rad.", "",
+            f"Goals of the room that it never learns from, and that are not the suite's: {measured[-1]['goals']:.0f} "
+            "at each point, with Wilson's 95 % intervals. A tolerance, 7.5 cm or 0.5 rad, counts as success.", "",
             "![Goals reached over environment steps, and how near it comes](learning.png)"]
 
 

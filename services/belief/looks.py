@@ -1,8 +1,8 @@
 """What comparisons of views with the goal image, at the resolution that is there, say of the goal's direction.
 
-A view from the goal's direction agrees with the goal image, and one from elsewhere does not. So each comparison makes
-its own direction likelier or less likely than it was, and says nothing of others. Where two sides of an object have
-been looked at, the posterior weighs both comparisons.
+A view from the goal's direction agrees with the goal image, one from beside it agrees in part and points to it, and one
+from elsewhere hardly agrees. So each comparison makes directions around its own likelier or less likely than they were,
+and says nothing of others. Where two sides of an object have been looked at, the posterior weighs both comparisons.
 """
 
 from __future__ import annotations
@@ -17,27 +17,28 @@ from saccade.shared.world.symmetry import turns_of
 
 Array = NDArray[np.float64]
 
-# Fitted to views of 150 development scenes: log of how much likelier an agreement is from the goal's direction
-# than from elsewhere.
-PER_AGREEMENT, WITHOUT = 18.0, -6.5
-AROUND_RAD = 0.15  # chosen: a comparison counts for directions within about this angle
-IN_PART = 0.2  # chosen: a view that agrees so well may be from beside the goal's direction
-BESIDE_RAD = (0.06, 0.6)  # chosen: how far beside
-WORTH_A_LOOK = 4.0  # chosen: what such a view makes of the log ratio there, at most
-FIRST_RAD = 0.15  # chosen: a comparison from so much farther away decides before one that only points there
+# Fitted to 1,400 views of goals of ten objects: the agreement from the goal's own direction, within what angle it falls
+# to the e-th part, its standard deviation, and its mean from elsewhere, where it is distributed exponentially; but a
+# share of such views shows a side that is much like the goal's, and agrees up to a limit.
+AGREES, WITHIN_RAD, AGREES_STD, ELSEWHERE = 0.76, 0.24, 0.16, 0.1
+LIKE_IT, UP_TO = 0.05, 0.65
+UNEXPLAINED = 0.01  # chosen: share of views from anywhere that agree as those from elsewhere do
+POINTS = 0.12  # chosen: views that agree more than this point to the goal's direction
+POINTS_RIGHTLY = 0.8  # chosen: share of them that do so rightly
+POINTS_STD_RAD, ANYHOW_RAD = 0.08, 0.3  # fitted: how exactly, and how far those that do not point to it point aside
+TURNED = 0.5  # chosen: from above, another azimuth turns the image: what this counts, in ways along the sphere
 SAME_RAD = 0.08  # chosen: of comparisons from within this angle the last counts
 
 
 class Look(NamedTuple):
-    """One comparison: where the camera was [3] (m, world), the log of the ratio of likelihoods, how many times farther
-    than in this view the goal image shows the object, by how much the goal's azimuth is another, and how well
-    the view agrees."""
+    """One comparison: where the camera was [3] (m, world), how well the view agrees, how many times farther than in
+    this view the goal image shows the object, and by how much the goal's azimuth and elevation seem to be others."""
 
     eye: Array
-    log_ratio: float
+    agreement: float
     farther: float
     aside_rad: float
-    agreement: float
+    above_rad: float
 
 
 class Looks:
@@ -47,42 +48,36 @@ class Looks:
         self._equal_rad = turns_of(symmetry, GRID_AZIMUTHS)
         self._looks: list[Look] = []
 
-    def take(self, eye: Array, center: Array, agreement: float, farther: float, aside_rad: float = 0.0) -> None:
+    def take(self, eye: Array, center: Array, agreement: float, farther: float, aside_rad: float = 0.0,
+             above_rad: float = 0.0) -> None:
         """Takes the agreement of the view from `eye` [3] of an object at `center` [3] (m, world), how many times
-        farther the goal image shows it, and by how much larger the azimuth of the goal's view seems to be.
-
-        A view that agrees in part, from beside the goal's direction, makes the direction worth a look to which it
-        points; what is seen there decides.
-        """
+        farther the goal image shows it, and by how much larger azimuth and elevation of the goal's view seem to be."""
         towards = unit(eye - center)
         self._looks = [look for look in self._looks if unit(look.eye - center) @ towards < np.cos(SAME_RAD)]
-        log_ratio = WITHOUT + PER_AGREEMENT * agreement
-        points = agreement > IN_PART and BESIDE_RAD[0] < abs(aside_rad) < BESIDE_RAD[1]
-        if points and log_ratio < WORTH_A_LOOK:
-            log_ratio = min(log_ratio + PER_AGREEMENT * abs(aside_rad), WORTH_A_LOOK)
-        self._looks.append(Look(np.array(eye), log_ratio, farther, aside_rad if points else 0.0,
-                                agreement))
+        self._looks.append(Look(np.array(eye), agreement, farther, aside_rad, above_rad))
 
     def carried(self, move_m: Array) -> None:
         """Moves the views along with an object that drifts by `move_m` [3] (metres)."""
         self._looks = [look._replace(eye=look.eye + move_m) for look in self._looks]
 
     def log_ratio(self, center: Array) -> Array | None:
-        """The log of the ratio for each direction of the viewing grid [E, A], by the comparison from nearest to it.
-        None before the first comparison."""
+        """The log of how much likelier the comparison from nearest to it is, if this is the goal's direction, than if
+        the goal's is elsewhere, for each direction of the viewing grid [E, A]. None before the first comparison."""
         if not self._looks:
             return None
         elevation, azimuth = viewing_grid()
         at_azimuth, at_elevation, _ = spherical(np.array([look.eye for look in self._looks]), center)
-        up = elevation[:, None, None] - at_elevation
-        aside = azimuth[:, None] - at_azimuth - np.array([look.aside_rad for look in self._looks])
-        around = np.min([np.abs(wrap(aside + equal)) for equal in self._equal_rad], axis=0)
-        way = np.hypot(up, around)  # [E, A, looks]: near the pole, too, a change of azimuth rotates the image
-        later = np.array([FIRST_RAD if look.aside_rad else 0.0 for look in self._looks])  # what is seen there decides
-        nearest = (way + later).argmin(-1)
-        ratios = np.array([look.log_ratio for look in self._looks])[nearest]
-        nearest_way = np.take_along_axis(way, nearest[..., None], -1)[..., 0]
-        return np.asarray(ratios * np.exp(-0.5 * (nearest_way / AROUND_RAD) ** 2))
+        up = np.broadcast_to(elevation[:, None, None] - at_elevation,
+                             (len(elevation), len(azimuth), len(self._looks)))
+        turned = wrap(azimuth[:, None, None] - at_azimuth[:, None] + self._equal_rad)
+        least = np.abs(turned).argmin(-1)
+        around = np.broadcast_to(np.take_along_axis(turned, least[..., None], -1)[..., 0], up.shape)
+        nearest = _way(up, around, at_elevation).argmin(-1)[..., None]
+        up, around = (np.take_along_axis(each, nearest, -1)[..., 0] for each in (up, around))
+        agreement, aside, above = (np.array([getattr(look, of) for look in self._looks])[nearest[..., 0]]
+                                   for of in ("agreement", "aside_rad", "above_rad"))
+        height = at_elevation[nearest[..., 0]]
+        return _log_ratio(agreement, _way(up, around, height), _way(up - above, around - aside, height))
 
     def range_m(self, center: Array) -> float | None:
         """The range (m) at which the goal image shows the object, by the comparison that agrees best. None if none
@@ -91,6 +86,23 @@ class Looks:
         In two views from one direction the networks make the same error of the size, so that their ratio is exact.
         """
         best = max(self._looks, key=lambda look: look.agreement, default=None)
-        if best is None or WITHOUT + PER_AGREEMENT * best.agreement < 0.0:
+        if best is None or _log_ratio(np.array(best.agreement), np.zeros(()), np.zeros(())) < 0.0:
             return None
         return float(np.linalg.norm(best.eye - center)) * best.farther
+
+
+def _way(up: Array, around: Array, elevation: Array) -> Array:
+    """How far two views of an object are apart (rad) which differ by these angles, at an elevation."""
+    return np.sqrt(up ** 2 + around ** 2 * (np.cos(elevation) ** 2 + (TURNED * np.sin(elevation)) ** 2))
+
+
+def _log_ratio(agreement: Array, way: Array, beside: Array) -> Array:
+    """The log of how much likelier an agreement is if the goal's direction is `way` (rad) from here, and `beside` (rad)
+    from where the view points to, than if it is elsewhere."""
+    near = np.exp(-(way / WITHIN_RAD) ** 2)
+    elsewhere = (1.0 - LIKE_IT) * np.exp(-agreement / ELSEWHERE) / ELSEWHERE + LIKE_IT / UP_TO * (agreement < UP_TO)
+    apart = (agreement - AGREES * near) / AGREES_STD
+    here = np.exp(-0.5 * apart ** 2) / (AGREES_STD * np.sqrt(2 * np.pi))
+    spread = (ANYHOW_RAD / POINTS_STD_RAD) ** 2 * np.exp(-0.5 * (beside / POINTS_STD_RAD) ** 2)
+    points = np.where(agreement > POINTS, POINTS_RIGHTLY * spread + 1.0 - POINTS_RIGHTLY, 1.0)
+    return np.asarray(np.log(near * here * points / elsewhere + 1.0 - near + UNEXPLAINED))

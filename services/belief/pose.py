@@ -188,8 +188,9 @@ class GoalView:
             self.keyframes = []
         eye = percept.world_from_camera[:3, 3]
         if percept.goal_agreement is not None:
-            farther = percept.scale * self.measured_range_m / REFERENCE_RANGE_M
-            self.looks.take(eye, self.center, percept.goal_agreement, farther, percept.goal_aside_rad or 0.0)
+            farther = percept.scale * self.measured_range_m / REFERENCE_RANGE_M * np.exp(percept.goal_log_larger or 0.0)
+            self.looks.take(eye, self.center, percept.goal_agreement, farther, percept.goal_aside_rad or 0.0,
+                            percept.goal_above_rad or 0.0)
         quality = percept.presence / (CERTAIN + percept.log_scale_std)
         near = [k for k in self.keyframes if _angle(k.eye, eye, self.center) < NEW_VIEW_RAD]
         if near and max(k.quality for k in near) * BETTER > quality:

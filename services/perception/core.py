@@ -18,7 +18,7 @@ from saccade.services.perception.networks import INPUT_PX, Extraction, Identity,
 from saccade.services.perception.open_world import open_world_of
 from saccade.services.perception.paper import PaperSceneCCN
 from saccade.services.perception.posecnn import PoseCNN
-from saccade.services.perception.same_view import Agreement, SameView
+from saccade.services.perception.same_view import GOAL_UP, Agreement, SameView
 from saccade.services.perception.seen import Seen, bits
 from saccade.services.perception.several import AGAINST, Group, groups
 from saccade.shared.bus.messages import Frame, Goal, Percept
@@ -33,7 +33,6 @@ from saccade.shared.world.windows import Window
 
 SERVICE = Service("perception", inputs=(FRAME, GOAL), trigger=FRAME, outputs=(PERCEPT, GOAL_PERCEPT),
                   divisible=True)
-GOAL_UP = (0.0, 1.0, 0.0)  # of a goal image nothing is known but that it stands upright
 
 
 @dataclass(frozen=True)
@@ -205,7 +204,9 @@ class Perception:
     def _told(self, name: str, row: int, frame: Frame, seen: Seen, agrees: Agreement | None) -> Percept:
         """The percept of a row of what was seen, and how it agrees with the goal image."""
         told = percept(frame, name, seen, row, frame.world_from_camera)
-        return told if agrees is None else replace(told, goal_agreement=agrees.share, goal_aside_rad=agrees.aside_rad)
+        return told if agrees is None else replace(
+            told, goal_agreement=agrees.share, goal_aside_rad=agrees.aside_rad, goal_above_rad=agrees.above_rad,
+            goal_log_larger=agrees.log_larger)
 
     def _seen(self, model: Model, frame: Frame) -> tuple[Seen, list[Agreement | None]]:
         """What is seen in the frame, and how each row of it agrees with the goal image, if they are compared."""
@@ -228,7 +229,7 @@ class Perception:
             seen.presence[:] = 0.0
         rows = [seen.goal_row(k, np.array(rgb.shape[1::-1]) / 2) for k in range(len(self.names))]
         if is_given and self._compare is not None:
-            self.same_view = self._compare(rgb, goal.intrinsics_px, GOAL_UP, seen, rows)
+            self.same_view = self._compare(rgb, goal.intrinsics_px, seen, rows)
         for name, row in zip(self.names, rows, strict=True):
             yield Output(GOAL_PERCEPT, percept(goal, name, seen, row, np.eye(4)), name)
 

@@ -89,20 +89,20 @@ class TemplateMatcher:
         """Infers all objects from an image [H, W, 3]. `up` [3] is the direction of up in the camera's frame. The depth
         is not used."""
         found = self.detector.find(rgb, intrinsics_px, up)
-        window, count = found.window, len(self.names)
+        window, kinds = found.window, (*range(len(self.names)), *found.kinds)
         with torch.inference_mode():
             crops, masks = (x.numpy() for x in found.cropper.cut(window))
         range_m = REFERENCE_RANGE_M / window.scales
-        views = [self._estimate(k, crops[k], masks[k], range_m[k]) if found.presence[k] > WORTH_A_LOOK
-                 else View(0.0, 0.0, range_m[k]) for k in range(count)]
+        views = [self._estimate(k, crops[row], masks[row], range_m[row]) if found.presence[row] > WORTH_A_LOOK
+                 else View(0.0, 0.0, range_m[row]) for row, k in enumerate(kinds)]
         rays = pixel_rays(window.pixels, intrinsics_px)
         seen_from = np.stack([look_at(direction(v.azimuth, v.elevation), np.zeros(3))[:3, :3].T for v in views])
         ranges = np.array([view.range_m for view in views])
-        nothing = np.zeros((count, 0), dtype=np.float32)
+        nothing = np.zeros((len(kinds), 0), dtype=np.float32)
         difference = np.array([v.difference if np.isfinite(v.difference) else 0.0 for v in views]) * 3 * CROP_PX ** 2
         return Seen(found.presence, window.pixels, found.side_px * found.deviation[:, :2].mean(1),
                     REFERENCE_RANGE_M / ranges, found.deviation[:, 2], nothing, nothing, difference, found.mask_bits,
-                    pose(upright(rays, up) @ seen_from, rays * ranges[:, None]))
+                    pose(upright(rays, up) @ seen_from, rays * ranges[:, None]), kinds=found.kinds)
 
     def _estimate(self, k: int, crop: NDArray[np.float32], mask: NDArray[np.float32], range_m: float) -> View:
         """The view that resembles a crop [3, 64, 64] of object number `k` most, where the mask [1, 64, 64] shows it."""

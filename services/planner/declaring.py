@@ -13,18 +13,20 @@ import numpy as np
 
 from saccade.shared.bus.messages import Belief
 from saccade.shared.world.directions import alike
-from saccade.shared.world.geometry import Array, direction, unit, viewing_grid
+from saccade.shared.world.geometry import Array, direction, rotation_angle, rotation_towards, unit, viewing_grid
 
 CERTAIN = 0.9  # chosen: beside a rival, or if the target is hidden, the posterior must be so sure
-ALIKE = 0.38  # chosen: so well a view must agree; nearly all from the goal's direction do, and no back of a can
-IN_PART = 0.3  # chosen: a view that agrees so well is not given up, but the agent looks beside it
+ALIKE = 0.45  # chosen: so well a view must agree; nearly all from the goal's direction do, and no back of a can
+CLEARLY_ALIKE = 0.7  # chosen: beside a rival a view must agree so well; views of another side hardly ever do
+IN_PART = 0.2  # chosen: a view that agrees so well is not given up, but the agent looks beside it
 SURE = 0.6  # chosen: the agent says so if looks and fused views together leave at least this probability
+COMPARED = 0.8  # chosen: and of a view that was compared at least this
 UNLIKELY = 0.25  # chosen: a view that has a lower probability is not the goal's
 CLEAR = 0.93  # chosen: looks that are clearer than this need no look at rivals; a view that may be wrong reaches 0.95
 FLOOR = 0.02  # chosen: neither the looks nor the fused views count as surer than this leaves
 RIVAL = 0.25  # chosen: a direction with this probability around it is a rival of the likeliest one
 BESIDE, BESIDE_RAD = 6, 0.22  # chosen: from how many directions around a view the agent looks, and how far from it
-AROUND_RAD, APART_RAD = 0.4, 0.8  # chosen: what counts as around a direction, and how far rivals are from one another
+AROUND_RAD, APART_RAD = 0.4, 0.8  # chosen: what counts as around a direction, and as far from it
 
 
 class Evidence(NamedTuple):
@@ -57,7 +59,8 @@ class Evidence(NamedTuple):
         if self.look == 0.0:  # something hides the target here, so that this view says nothing
             return self.fused > CERTAIN and not self.rival
         if self.agreement is not None:
-            return self.probability > (CERTAIN if self.rival else SURE)
+            is_clear = self.probability > CERTAIN and self.agreement > CLEARLY_ALIKE
+            return is_clear if self.rival else self.probability > COMPARED
         return self.probability > SURE and (self.look > CLEAR or not self.rival)
 
 
@@ -86,7 +89,11 @@ def around(towards: Array) -> list[Array]:
 
 
 class Rivals:
-    """Directions [3] from the target that have once been likely, and from which the agent has not looked yet."""
+    """Directions [3] from the target that have once been likely, and from which the agent has not looked yet.
+
+    How far two directions are apart is how far the camera is turned between the views: nearly above the target, views
+    from about one place may show it turned.
+    """
 
     def __init__(self) -> None:
         self.directions: list[Array] = []
@@ -103,24 +110,32 @@ class Rivals:
         left = np.ones(len(share), dtype=bool)
         for _ in range(2):
             peak = towards[np.argmax(np.where(left, share, -1.0))]
-            if share[towards @ peak > np.cos(AROUND_RAD)].sum() < RIVAL:
+            apart = turn_between(peak, towards)
+            if share[apart < AROUND_RAD].sum() < RIVAL:
                 return
-            if all(peak @ known < np.cos(APART_RAD) for known in (*self.directions, *(seen for seen, _ in self._seen))):
+            if all(turn_between(peak, known) > APART_RAD
+                   for known in (*self.directions, *(seen for seen, _ in self._seen))):
                 self.directions.append(peak)
-            left &= towards @ peak < np.cos(APART_RAD)
+            left &= apart > APART_RAD
 
     def looked(self, camera: Array, center: Array, look: float) -> None:
         """The agent has looked at the target from the pose of a camera [4, 4]: the probability by these looks."""
         here = unit(camera[:3, 3] - center)
-        self._seen = [each for each in self._seen if each[0] @ here < np.cos(AROUND_RAD)] + [(here, look)]
-        self.directions = [each for each in self.directions if each @ here < np.cos(APART_RAD)]
+        self._seen = [each for each in self._seen if turn_between(here, each[0]) > AROUND_RAD] + [(here, look)]
+        self.directions = [each for each in self.directions if turn_between(here, each) > APART_RAD]
 
     def elsewhere(self, camera: Array, center: Array) -> float:
         """The best look from a direction far from that of a camera [4, 4]. 0 if there was none."""
         here = unit(camera[:3, 3] - center)
-        return max((look for seen, look in self._seen if seen @ here < np.cos(APART_RAD)), default=0.0)
+        return max((look for seen, look in self._seen if turn_between(here, seen) > APART_RAD), default=0.0)
 
     def beside(self, camera: Array, center: Array) -> Array | None:
         """A rival [3] of the direction of a camera [4, 4]. None if there is none."""
         here = unit(camera[:3, 3] - center)
-        return next((each for each in self.directions if each @ here < np.cos(APART_RAD)), None)
+        return next((each for each in self.directions if turn_between(here, each) > APART_RAD), None)
+
+
+def turn_between(one: Array, others: Array) -> Array:
+    """The angles (rad) by which cameras are turned that look from directions `others` [..., 3], against one that looks
+    from `one` [3], all of them without roll."""
+    return rotation_angle(rotation_towards(-others), rotation_towards(-one))

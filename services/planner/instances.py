@@ -28,6 +28,7 @@ class Tried:
     is_near: bool = False  # the goal's view is sure to be near, and the agent goes to where it is believed to be
     said: int = 0  # steps in which the agent has said that it is there
     beside: list[Array | None] | None = None  # directions [3] around such a view from which it will look; then back
+    in_part: int = 0  # arrivals since the last that was given up at views that agree in part
     visited: list[Array] = field(default_factory=list)  # camera poses [4, 4] at which it arrived in the mode "goal"
 
 

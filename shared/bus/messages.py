@@ -98,7 +98,7 @@ class Percept(Message):
     """What the networks of one object made of one image (paper, section 3.2), on `percept` and `goal_percept`. On
     `goal_percept` the camera's pose is unknown: the identity stands for it."""
 
-    VERSION: ClassVar[int] = 6
+    VERSION: ClassVar[int] = 7
 
     object: str
     """Name of the object."""
@@ -139,6 +139,10 @@ class Percept(Message):
     goal_aside_rad: float | None = None
     """By how much the azimuth of the goal's view is larger than that of this one, as these features are turned and
     shifted."""
+    goal_above_rad: float | None = None
+    """By how much its elevation is larger."""
+    goal_log_larger: float | None = None
+    """Logarithm of how much larger than in the goal image the object is, by these features against `scale`."""
     further: list[Percept] = field(default_factory=list)
     """What else in the image may be one of its kind, the likeliest first. These have no further ones."""
 

@@ -112,9 +112,21 @@ def with_beliefs_of_instances() -> Change:
     return change
 
 
+def with_the_way_to_the_goal() -> Change:
+    """Format 8 to 9: comparisons with the goal image tell the way up and the size, too."""
+    def change(topic: Topic, part: str | None, fields: Fields) -> Fields:
+        if topic.type is not m.Percept:
+            return fields
+        added = {"version": 7, "goal_above_rad": None, "goal_log_larger": None}
+        return fields | added | {"further": [each | added for each in fields["further"]]}
+
+    return change
+
+
 CHANGES: tuple[Callable[[], Change], ...] = (count_in_episodes, with_masks_and_candidates, with_poses,
                                              with_several_rotations, with_places_and_instances,
-                                             with_motion_and_comparisons, with_beliefs_of_instances)
+                                             with_motion_and_comparisons, with_beliefs_of_instances,
+                                             with_the_way_to_the_goal)
 FORMAT = OLDEST + len(CHANGES)
 
 
