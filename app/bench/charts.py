@@ -117,7 +117,7 @@ def draw_final_views(stories: Mapping[str, Sequence[Story]], out: Path) -> None:
 
 
 def draw_learning(measured: Sequence[Mapping[str, float]], paper: tuple[float, float], out: Path) -> None:
-    """Draws how LEXA learns, against the environment steps that it has lived through: the share of goals that it reaches
+    """Draws how LEXA learns, against the environment steps that it has lived through: the share of goals it reaches
     (%), with Wilson's 95 % intervals, and the median of how near it comes. `paper` is the paper's (steps, %)."""
     figure = new_figure((9.0, 3.6))
     share, nearest = figure.subplots(1, 2)
