@@ -1,10 +1,10 @@
-"""`python -m saccade.benchmarks.calibration OUT [--objects SET] [--agent AGENT] [--suite SUITE] [--limit N] [--seed N]`
-compares what an agent believes with the truth, step by step.
+"""`python -m saccade.benchmarks.calibration OUT [--objects SET] [--agent AGENT] [--suite SUITE] [--limit N] [--seed N]
+[--before FILE]` compares what an agent believes with the truth, step by step.
 
 Three probabilities are compared. A percept says that its object is in the image; an object of which less than 0.3 is
 seen, but something, counts neither way. A belief says that its object is on the table. And the belief about the target
 gives a probability that the camera is within the tolerance of the goal. OUT is the file of the results; the picture of
-the reliability curves lies beside it.
+the reliability curves lies beside it, with those of results from before if a file of them is named.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from rich.progress import track
 
 from saccade.app.bench.bench import RUN, cores, prepare
 from saccade.app.look.picture import new_figure, save
+from saccade.app.palette import COLOURS
 from saccade.app.run.registry import agent_of
 from saccade.services.planner.goal import Preference, aim, infer_preference
 from saccade.services.simulator.suites import SUITES
@@ -27,7 +28,7 @@ from saccade.shared.bus.messages import Belief, Message, Percept, Truth
 from saccade.shared.bus.topics import GOAL_PERCEPT, PERCEPT, Topic
 from saccade.shared.config import load
 from saccade.shared.errors import SaccadeError
-from saccade.shared.files import write_json
+from saccade.shared.files import parse_json, read_text, write_json
 from saccade.shared.log.provenance import commit
 from saccade.shared.loop.local import run_local
 from saccade.shared.render.objects import load_mesh
@@ -37,6 +38,7 @@ from saccade.shared.world.task import success
 from saccade.shared.world.workspace import NO_BOXES, Boxes
 
 BINS = 10
+MAX_BYTES = 1024 * 1024
 DRAWN = 200  # goal poses that are drawn from a belief
 KINDS = {"percept": "the object is in the image", "belief": "the object is on the table",
          "within": "the camera is within the tolerance"}
@@ -136,20 +138,29 @@ def measure(options: argparse.Namespace, console: Console) -> dict[str, Any]:
             "scenes": len(plan.chosen), "commit": commit()} | {kind: reliability(each) for kind, each in told.items()}
 
 
-def draw(results: dict[str, Any], out: Path) -> None:
-    """Draws the reliability curves; the size of a point tells how many probabilities are in its bin."""
+def draw(curves: dict[str, dict[str, Any]], out: Path) -> None:
+    """Draws the reliability curves of results, by their names; the size of a point tells how many probabilities are in
+    its bin."""
     figure = new_figure((12.0, 4.2))
     for axes, (kind, title) in zip(figure.subplots(1, len(KINDS)), KINDS.items(), strict=True):
-        bins, count = results[kind]["bins"], results[kind]["count"]
         axes.plot([0, 1], [0, 1], color="grey", linewidth=0.8)
-        axes.plot([each["told"] for each in bins], [each["was"] for each in bins], color="C0")
-        axes.scatter([each["told"] for each in bins], [each["was"] for each in bins], color="C0",
-                     s=[10 + 200 * each["count"] / count for each in bins])
-        error = results[kind]["expected_calibration_error"]
-        axes.set(xlabel="probability that was told", title=f"{title}\nexpected calibration error {error:.3f}",
-                 xlim=(-0.03, 1.03), ylim=(-0.03, 1.03))
+        for (name, results), colour in zip(curves.items(), COLOURS, strict=False):
+            bins, count, error = (results[kind][key] for key in ("bins", "count", "expected_calibration_error"))
+            told, was = ([each[key] for each in bins] for key in ("told", "was"))
+            axes.plot(told, was, color=colour, label=f"{name}: expected calibration error {error:.3f}")
+            axes.scatter(told, was, color=colour, s=[10 + 200 * each["count"] / count for each in bins])
+        axes.set(xlabel="probability that was told", title=title, xlim=(-0.03, 1.03), ylim=(-0.03, 1.03))
+        axes.legend(fontsize=7, loc="upper left")
     figure.axes[0].set_ylabel("how often it was so")
     save(figure, out)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """Results from before. Raises SaccadeError if they are none of this benchmark."""
+    results = parse_json(read_text(path, "results", "name another file", MAX_BYTES))
+    if not (isinstance(results, dict) and results.keys() >= KINDS.keys()):
+        raise SaccadeError(f"results {path} are not of this benchmark: name another file")
+    return results
 
 
 def main() -> None:
@@ -163,11 +174,13 @@ def main() -> None:
     parser.add_argument("--limit", type=int, default=25)
     parser.add_argument("--steps", type=int, default=60)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--before", type=Path)
     options, console = parser.parse_args(), Console()
     try:
-        results = measure(options, console)
+        curves = {} if options.before is None else {"before": _read(options.before)}
+        curves["now"] = results = measure(options, console)
         write_json(options.out, results, "results")
-        draw(results, options.out.with_suffix(".png"))
+        draw(curves, options.out.with_suffix(".png"))
     except SaccadeError as error:
         parser.exit(2, f"saccade: {error}\n")
     for kind, title in KINDS.items():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from saccade.benchmarks.calibration import Told, reliability, within_tolerance
+from saccade.benchmarks.calibration import KINDS, Told, draw, reliability, within_tolerance
 from saccade.services.planner.goal import Preference, aim
 from saccade.shared.bus.messages import Belief
 from saccade.shared.world.geometry import INTRINSICS_PX, direction, viewing_grid
@@ -19,6 +19,12 @@ def test_the_error_is_the_mean_distance_of_what_was_told_from_how_often_it_was_s
 
 def test_a_probability_of_one_is_in_the_last_bin():
     assert reliability([Told(1.0, True)])["bins"] == [{"count": 1, "told": 1.0, "was": 1.0}]
+
+
+def test_the_curves_from_before_are_drawn_beside_those_of_now(tmp_path):
+    results = dict.fromkeys(KINDS, reliability([Told(0.7, True), Told(0.1, False)]))
+    draw({"before": results, "now": results}, tmp_path / "curves.png")
+    assert (tmp_path / "curves.png").stat().st_size > 5000
 
 
 def test_the_camera_is_within_the_tolerance_if_all_goal_poses_are_near_it_and_not_if_it_is_elsewhere():
