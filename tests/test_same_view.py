@@ -118,6 +118,15 @@ def test_what_a_comparison_says_of_a_symmetric_object_holds_wherever_it_looks_th
     assert abs(ratio_at(looks, 1.0 + np.pi / 2)) < 0.1
 
 
+def test_of_two_sides_that_look_alike_the_one_that_agrees_better_is_the_goals():
+    looks = Looks(NONE)
+    looks.take(at(1.0 + np.pi), CENTER, 0.52, 1.0)
+    alone = ratio_at(looks, 1.0 + np.pi)
+    looks.take(at(1.0), CENTER, 0.64, 1.0)
+    assert alone > 3
+    assert ratio_at(looks, 1.0) > ratio_at(looks, 1.0 + np.pi) + 4
+
+
 def test_the_view_that_agrees_best_tells_the_goals_range():
     """If it agrees at all: a view from elsewhere says nothing of the range."""
     looks = Looks(NONE)

@@ -27,6 +27,9 @@ POINTS = 0.12  # chosen: views that agree more than this point to the goal's dir
 POINTS_RIGHTLY = 0.8  # chosen: share of them that do so rightly
 POINTS_STD_RAD, ANYHOW_RAD = 0.08, 0.3  # fitted: how exactly, and how far those that do not point to it point aside
 TURNED = 0.5  # chosen: from above, another azimuth turns the image: what this counts, in ways along the sphere
+# Chosen: a comparison from farther than this from the best one counts for so much less (nats, for what it agrees less)
+# and at most so much less, if the best one agrees so well. Of two sides that look much alike the goal's agrees better.
+OTHER_SIDE_RAD, PER_LESS, AT_MOST, WELL = 0.6, 30.0, 6.0, 0.5
 SAME_RAD = 0.08  # chosen: of comparisons from within this angle the last counts
 
 
@@ -76,8 +79,19 @@ class Looks:
         up, around = (np.take_along_axis(each, nearest, -1)[..., 0] for each in (up, around))
         agreement, aside, above = (np.array([getattr(look, of) for look in self._looks])[nearest[..., 0]]
                                    for of in ("agreement", "aside_rad", "above_rad"))
-        height = at_elevation[nearest[..., 0]]
-        return _log_ratio(agreement, _way(up, around, height), _way(up - above, around - aside, height))
+        height, way = at_elevation[nearest[..., 0]], _way(up, around, at_elevation[nearest[..., 0]])
+        ratio = _log_ratio(agreement, way, _way(up - above, around - aside, height))
+        return ratio - _near(way) * self._worse(center)[nearest[..., 0]]
+
+    def _worse(self, center: Array) -> Array:
+        """By how many nats each comparison counts less because another side agrees better [looks]."""
+        best = max(self._looks, key=lambda look: look.agreement)
+        if len(self._equal_rad) > 1 or best.agreement < WELL:
+            return np.zeros(len(self._looks))
+        towards = unit(np.array([look.eye for look in self._looks]) - center)
+        other = towards @ unit(best.eye - center) < np.cos(OTHER_SIDE_RAD)
+        less = np.array([best.agreement - look.agreement for look in self._looks])
+        return np.asarray(other * np.minimum(PER_LESS * less, AT_MOST))
 
     def range_m(self, center: Array) -> float | None:
         """The range (m) at which the goal image shows the object, by the comparison that agrees best. None if none
@@ -96,10 +110,15 @@ def _way(up: Array, around: Array, elevation: Array) -> Array:
     return np.sqrt(up ** 2 + around ** 2 * (np.cos(elevation) ** 2 + (TURNED * np.sin(elevation)) ** 2))
 
 
+def _near(way: Array) -> Array:
+    """What part of the agreement from the goal's own direction a view has from beside it, `way` (rad) away."""
+    return np.asarray(np.exp(-(way / WITHIN_RAD) ** 2))
+
+
 def _log_ratio(agreement: Array, way: Array, beside: Array) -> Array:
     """The log of how much likelier an agreement is if the goal's direction is `way` (rad) from here, and `beside` (rad)
     from where the view points to, than if it is elsewhere."""
-    near = np.exp(-(way / WITHIN_RAD) ** 2)
+    near = _near(way)
     elsewhere = (1.0 - LIKE_IT) * np.exp(-agreement / ELSEWHERE) / ELSEWHERE + LIKE_IT / UP_TO * (agreement < UP_TO)
     apart = (agreement - AGREES * near) / AGREES_STD
     here = np.exp(-0.5 * apart ** 2) / (AGREES_STD * np.sqrt(2 * np.pi))

@@ -185,6 +185,8 @@ class Planner:
             else:
                 evidence = self._evidence(target, camera)
                 self.now.is_near = evidence.is_enough
+                if evidence.is_enough:
+                    self.now.wanted = None
                 declared = evidence.is_enough and self._is_at(eye, camera, evidence)
                 if declared and self._was_wrong():
                     declared = self.now.is_near = False

@@ -24,7 +24,7 @@ COMPARED = 0.8  # chosen: and of a view that was compared at least this
 UNLIKELY = 0.25  # chosen: a view that has a lower probability is not the goal's
 CLEAR = 0.93  # chosen: looks that are clearer than this need no look at rivals; a view that may be wrong reaches 0.95
 FLOOR = 0.02  # chosen: neither the looks nor the fused views count as surer than this leaves
-RIVAL = 0.25  # chosen: a direction with this probability around it is a rival of the likeliest one
+RIVAL = 0.1  # chosen: a direction with this probability around it is a rival of the likeliest one
 BESIDE, BESIDE_RAD = 6, 0.22  # chosen: from how many directions around a view the agent looks, and how far from it
 AROUND_RAD, APART_RAD = 0.4, 0.8  # chosen: what counts as around a direction, and as far from it
 
