@@ -62,6 +62,12 @@ def test_a_view_that_was_compared_with_the_goal_image_counts_by_what_all_compari
     assert Evidence(0.1, 0.95, rival=True, elsewhere=0.9, agreement=0.8).is_enough
 
 
+def test_where_other_views_were_compared_one_that_cannot_be_needs_more():
+    assert Evidence(0.39, 0.8).is_enough
+    assert not Evidence(0.39, 0.8, compared=True).is_enough
+    assert Evidence(0.9, 0.9, compared=True).is_enough
+
+
 def test_a_view_that_agrees_in_part_is_not_given_up():
     """The goal's may be beside it. Another side agrees less."""
     assert Evidence(0.5, 0.3, agreement=0.35).is_beside
@@ -96,7 +102,7 @@ def test_a_direction_that_was_once_likely_stays_a_rival_until_it_was_looked_from
     rivals.take(belief(2, FRONT, posterior(front=0.5, back=0.4), 0.0))
     assert rivals.beside(FRONT, CENTER) is None
     alone = Rivals()
-    alone.take(belief(0, ASIDE, posterior(front=0.8, back=0.1), 0.0))
+    alone.take(belief(0, ASIDE, posterior(front=0.8, back=0.05), 0.0))
     assert alone.beside(FRONT, CENTER) is None
 
 

@@ -127,6 +127,13 @@ def test_of_two_sides_that_look_alike_the_one_that_agrees_better_is_the_goals():
     assert ratio_at(looks, 1.0) > ratio_at(looks, 1.0 + np.pi) + 4
 
 
+def test_from_above_views_that_are_turned_are_others_though_they_are_from_about_one_place():
+    looks = Looks(NONE)
+    looks.take(at(1.0, 1.5), CENTER, 0.7, 1.0)
+    looks.take(at(1.0 + np.pi, 1.5), CENTER, 0.2, 1.0)
+    assert ratio_at(looks, 1.0, 1.5) > 4 > -2 > ratio_at(looks, 1.0 + np.pi, 1.5)
+
+
 def test_the_view_that_agrees_best_tells_the_goals_range():
     """If it agrees at all: a view from elsewhere says nothing of the range."""
     looks = Looks(NONE)

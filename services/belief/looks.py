@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from saccade.shared.world.geometry import GRID_AZIMUTHS, spherical, unit, viewing_grid, wrap
+from saccade.shared.world.geometry import GRID_AZIMUTHS, spherical, viewing_grid, wrap
 from saccade.shared.world.symmetry import turns_of
 
 Array = NDArray[np.float64]
@@ -55,8 +55,7 @@ class Looks:
              above_rad: float = 0.0) -> None:
         """Takes the agreement of the view from `eye` [3] of an object at `center` [3] (m, world), how many times
         farther the goal image shows it, and by how much larger azimuth and elevation of the goal's view seem to be."""
-        towards = unit(eye - center)
-        self._looks = [look for look in self._looks if unit(look.eye - center) @ towards < np.cos(SAME_RAD)]
+        self._looks = [look for look in self._looks if _between(look.eye, eye, center) > SAME_RAD]
         self._looks.append(Look(np.array(eye), agreement, farther, aside_rad, above_rad))
 
     def carried(self, move_m: Array) -> None:
@@ -88,8 +87,7 @@ class Looks:
         best = max(self._looks, key=lambda look: look.agreement)
         if len(self._equal_rad) > 1 or best.agreement < WELL:
             return np.zeros(len(self._looks))
-        towards = unit(np.array([look.eye for look in self._looks]) - center)
-        other = towards @ unit(best.eye - center) < np.cos(OTHER_SIDE_RAD)
+        other = np.array([_between(look.eye, best.eye, center) > OTHER_SIDE_RAD for look in self._looks])
         less = np.array([best.agreement - look.agreement for look in self._looks])
         return np.asarray(other * np.minimum(PER_LESS * less, AT_MOST))
 
@@ -108,6 +106,12 @@ class Looks:
 def _way(up: Array, around: Array, elevation: Array) -> Array:
     """How far two views of an object are apart (rad) which differ by these angles, at an elevation."""
     return np.sqrt(up ** 2 + around ** 2 * (np.cos(elevation) ** 2 + (TURNED * np.sin(elevation)) ** 2))
+
+
+def _between(eye: Array, other: Array, center: Array) -> float:
+    """How far the views from two positions [3] of an object at `center` [3] (m) are apart (rad)."""
+    (azimuth, elevation, _), (azimuth_there, elevation_there, _) = spherical(eye, center), spherical(other, center)
+    return float(_way(elevation_there - elevation, wrap(azimuth_there - azimuth), elevation))
 
 
 def _near(way: Array) -> Array:

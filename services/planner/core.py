@@ -78,6 +78,7 @@ class Planner:
         self.target_instance = 1  # the one of the target's kind that the agent goes for
         self.tried = {1: Tried()}  # by the number of the instance
         self.velocity_m: Array | None = None  # of the target, as believed [3]
+        self.compared = False  # whether a view of the target was compared with the goal image
         return ()
 
     @property
@@ -239,7 +240,10 @@ class Planner:
         return verdict in ("renew", "wrong", "rival"), verdict == "there"
 
     def _note_rivals(self, beliefs: dict[str, Belief]) -> None:
-        """Keeps in mind which directions are likely now. Views that look the same are no rivals."""
+        """Keeps in mind which directions are likely now, and whether views are compared. Views that look the same are
+        no rivals."""
+        if self.preference is not None:
+            self.compared |= beliefs[self.preference.target].goal_agreement is not None
         if self.preference is not None and self.config.planner.retry \
                 and self.symmetry[self.preference.target] == NONE:
             self.now.rivals.take(beliefs[self.preference.target])
@@ -248,7 +252,7 @@ class Planner:
         fused = fused_here(target, camera, self.symmetry[target.object])
         return Evidence(target.goal_here, fused,
                         self.now.rivals.beside(camera, target.mean_m) is not None,
-                        self.now.rivals.elsewhere(camera, target.mean_m), target.goal_agreement)
+                        self.now.rivals.elsewhere(camera, target.mean_m), target.goal_agreement, self.compared)
 
     def _is_at(self, eye: Array | None, camera: Array, evidence: Evidence) -> bool:
         """Whether the camera is where the goal's view is believed to be, `eye` [3], now that it was compared. Where

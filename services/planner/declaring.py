@@ -33,13 +33,14 @@ class Evidence(NamedTuple):
     """What speaks for the goal's view being here: the probability by the looks from here, that by all views, whether a
     rival direction is left from which the agent has not looked, the probability by the best looks elsewhere, and
     how well the view agrees with the goal image, if it was compared: then the probability by all views holds all of
-    this."""
+    this. Where other views were `compared`, and this one shows the object too large or elsewhere, more is asked for."""
 
     look: float
     fused: float
     rival: bool = False
     elsewhere: float = 0.0
     agreement: float | None = None
+    compared: bool = False
 
     @property
     def probability(self) -> float:
@@ -61,7 +62,7 @@ class Evidence(NamedTuple):
         if self.agreement is not None:
             is_clear = self.probability > CERTAIN and self.agreement > CLEARLY_ALIKE
             return is_clear if self.rival else self.probability > COMPARED
-        return self.probability > SURE and (self.look > CLEAR or not self.rival)
+        return self.probability > (CERTAIN if self.compared else SURE) and (self.look > CLEAR or not self.rival)
 
 
 def together(looks: float, fused: float) -> float:
