@@ -73,6 +73,10 @@ def test_every_agent_of_the_paper_has_its_rows(tmp_path):
         cells(tmp_path, "ycb", ["oracle"])
     with pytest.raises(SaccadeError, match="'nobody' is unknown"):
         cells(tmp_path, "ycb", ["nobody"])
+    with pytest.raises(SaccadeError, match="names none: choose from sceneccn, "):
+        cells(tmp_path, "ycb", [])  # as of `--agents ''`: the page would have no row
+    with pytest.raises(SaccadeError, match="'mugs' has no suites for the table: choose from ycb, pantry"):
+        cells(tmp_path, "mugs", None)
 
 
 def test_how_lexa_learns_is_drawn_from_what_its_weights_say(tmp_path):

@@ -218,3 +218,11 @@ def test_weights_of_another_architecture_get_one_line(tmp_path, finished):
     config, _ = configured(None, EPISODE | {"bus.kind": "local", "perception.weights": tmp_path / "w"}, [], "lexa")
     with pytest.raises(SaccadeError, match=r"architecture 'default', and this agent needs 'lexa'"):
         run(config, agent="lexa", out=tmp_path / "r", plain=True, console=Console(file=io.StringIO()))
+
+
+def test_weights_that_lived_with_other_objects_get_one_line(tmp_path, finished):
+    """The policy knows no names, and would walk on without a word among things that it has never seen."""
+    given = {"bus.kind": "local", "scene.names": ["soup_can", "cereal_box"], "perception.weights": finished / "weights"}
+    config, _ = configured(None, EPISODE | given, [], "lexa")
+    with pytest.raises(SaccadeError, match="object 'cereal_box' has no weights in"):
+        run(config, agent="lexa", out=tmp_path / "r", plain=True, console=Console(file=io.StringIO()))

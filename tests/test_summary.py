@@ -47,6 +47,14 @@ def test_a_goal_of_nothing_known_is_said_with_its_confidence(values, result):
         result, "the goal image shows none of the known objects (confidence 0.31): the agent explored instead"]
 
 
+def test_who_knows_no_objects_is_not_said_to_have_looked_for_them():
+    """LEXA and the random walk name no target in any plan, and believe nothing."""
+    progress = Progress()
+    progress.take(PLAN, None, sample(PLAN.type, target="", goal_confidence=0.0))
+    progress.take(RESULT, None, sample(RESULT.type, scene="kitchen", success=False, declared=False, steps=12))
+    assert summary(Config(), progress.results, progress) == [FAILED]
+
+
 def test_who_only_explores_is_not_said_to_have_missed_anything():
     """There is no goal, so no target either: what was found is told instead."""
     lines = told(EXPLORE, success=False, target="", confidence=0.0)

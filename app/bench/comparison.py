@@ -22,7 +22,7 @@ from saccade.app.look.picture import Story
 from saccade.app.run.display import say
 from saccade.app.run.registry import AGENTS, agent_of
 from saccade.shared.config import Config, load
-from saccade.shared.errors import SaccadeError
+from saccade.shared.errors import SaccadeError, told
 from saccade.shared.files import replace_whole, writing
 from saccade.shared.model.weights import Weights
 
@@ -48,8 +48,14 @@ class Cell:
 
 
 def cells(out: Path, objects: str, agents: Sequence[str] | None) -> list[Cell]:
-    """All that is compared, suite by suite. Raises SaccadeError if an agent is unknown or has no place in the table."""
+    """All that is compared, suite by suite. Raises SaccadeError if the set has no suites, if no agent is named, or if
+    one is unknown or has no place in the table."""
     known = (*COMPARED, *IN_THE_ROOM)
+    if objects not in SUITES_OF:
+        raise SaccadeError(f"--objects {told(objects)} has no suites for the table: choose from "
+                           f"{', '.join(SUITES_OF)}")
+    if agents is not None and not agents:
+        raise SaccadeError(f"--agents names none: choose from {', '.join(known)}")
     for agent in agents or ():
         agent_of(agent)
         if agent not in known:

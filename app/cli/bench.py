@@ -84,7 +84,8 @@ def report(*, results: Annotated[list[Path], typer.Argument(
 
 @app.command()
 def table(*, out: Annotated[Path, typer.Option(help="Folder of the page and of the results.")],
-          objects: Objects = None,
+          objects: Annotated[str | None, typer.Option(
+              metavar="SET", help="Object set: ycb or pantry.", show_default="ycb")] = None,
           agents: Annotated[str | None, typer.Option(
               metavar="NAMES", help="Only these agents, such as posecnn,lexa.", show_default="all")] = None,
           limit: Annotated[int | None, typer.Option(

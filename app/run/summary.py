@@ -33,6 +33,8 @@ def _doubts(config: Config, progress: Progress) -> list[str]:
     plan = progress.plan
     if plan is None or config.scene.explore:
         return []
+    if not plan.target and not progress.beliefs:
+        return []  # it knows no objects, and so it looked for none in the goal image
     if not plan.target:
         return [f"the goal image shows none of the known objects (confidence {plan.goal_confidence:.2f}): the agent "
                 "explored instead"]

@@ -154,7 +154,7 @@ def small(rgb: NDArray[np.uint8]) -> Tensor:
 class Lexa:
     """Acts towards the goal image. Its state follows from the episode's images.
 
-    Raises SaccadeError if the weights are missing or damaged, or of another architecture.
+    Raises SaccadeError if the weights are missing or damaged, of another architecture, or for other objects.
     """
 
     def __init__(self, config: Config):
@@ -162,6 +162,7 @@ class Lexa:
         if weights.architecture != "lexa":
             raise SaccadeError(f"weights {weights.folder} are of the architecture {weights.architecture!r}, and this "
                                "agent needs 'lexa': name other weights, or choose the agent that works with these")
+        weights.cards_of(config.names)  # among others it would walk on without a word
         actor = weights.fill(Actor(), "lexa")
         assert isinstance(actor, Actor)  # it is what was filled
         self.actor, self.config = actor, config
