@@ -24,6 +24,7 @@ from saccade.shared.world.geometry import (
     direction,
     look_at,
     project,
+    rotation_angle,
     viewing_grid,
 )
 
@@ -125,6 +126,14 @@ def test_aim_sees_the_target_at_the_pixel_without_roll():
         assert np.allclose(project(target, camera, INTRINSICS_PX)[0], pixel, atol=1e-6)
         assert abs(camera[2, 0]) < 1e-9
         assert np.allclose(camera[:3, :3] @ camera[:3, :3].T, np.eye(3))
+
+
+def test_aim_from_right_above_is_turned_no_more_than_it_must_be():
+    """No camera without roll sees the target there; the clipped solution would be turned by a quarter."""
+    position, pixel = 0.34 * direction(3.0, 1.54), (INTRINSICS_PX[2] + 30.0, INTRINSICS_PX[3])
+    camera = aim(position, np.zeros(3), pixel, INTRINSICS_PX)
+    assert np.allclose(project(np.zeros(3), camera, INTRINSICS_PX)[0], pixel, atol=1e-6)
+    assert rotation_angle(camera[:3, :3], look_at(position, np.zeros(3))[:3, :3]) < 0.1
 
 
 def test_aim_at_the_principal_point_is_look_at():

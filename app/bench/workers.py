@@ -49,7 +49,7 @@ def _here(function: Callable[..., Any], work: Work, jobs: int) -> Results:
 
     parallel = Parallel(n_jobs=min(jobs, len(work)), backend="loky", batch_size=1, return_as="generator_unordered",
                         initializer=_follow_the_parent)
-    warnings.filterwarnings("ignore", "[0-9]+ tasks which were still being processed", UserWarning)  # after Ctrl-C
+    warnings.filterwarnings("ignore", "[0-9]+ tasks (which were still being|have been)", UserWarning)  # after Ctrl-C
     try:
         yield from parallel(delayed(_named)(function, scene, arguments) for scene, arguments in work.items())
     except TerminatedWorkerError as error:

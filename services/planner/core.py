@@ -45,7 +45,7 @@ THERE_M = 0.04  # chosen: a view that was compared is the goal's if the goal's i
 STUCK_M = 0.002  # chosen: a camera that moves less than this in a step counts as arrived, because it cannot come nearer
 TURN_M = 0.10  # chosen: nearer than this to its viewpoint the camera turns as planned; before, it looks at the target
 SAID = 3  # chosen: steps for which the agent says that it is there before it takes the episode's going on for a no
-IN_PART = 6  # chosen: arrivals at views that agree in part after which one of them counts as wrong
+PATIENT = 6  # chosen: arrivals at views that agree in part after which one of them counts as wrong
 VISITED_M = 0.05  # chosen: viewpoints within about this distance of one that was not the goal's also become costly
 VISITED_RAD = 0.35  # chosen: viewpoints within about this angle of one that was not the goal's also become costly
 VISITED_COST = 6.0  # chosen: nats that are added to the cost of a viewpoint that was not the goal's
@@ -201,7 +201,7 @@ class Planner:
 
     def _may_be_beside(self, evidence: Evidence) -> bool:
         """Whether the goal's view may be beside one that agrees in part. Where the agent comes no nearer, it is not."""
-        self.now.in_part = (self.now.in_part + 1) % IN_PART if evidence.is_beside else 0
+        self.now.in_part = (self.now.in_part + 1) % PATIENT if evidence.is_beside else 0
         return self.now.in_part > 0
 
     def _was_wrong(self) -> bool:

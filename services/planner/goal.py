@@ -8,17 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from saccade.shared.bus.messages import Percept
-from saccade.shared.world.geometry import (
-    REFERENCE_RANGE_M,
-    Array,
-    look_at,
-    pixel_rays,
-    pose,
-    rotation_angle,
-    unit,
-)
+from saccade.shared.world.geometry import REFERENCE_RANGE_M, Array, look_at, pixel_rays, pose, unit
 
-TURNED_FAR = 0.6  # chosen: angle (rad) from which on a camera without roll is turned too far
 OPPOSITE = -0.99  # cosine of an angle from which on the smallest turn is not well defined
 
 
@@ -57,25 +48,23 @@ def infer_preference(percepts: dict[str, Percept], range_std_m: float) -> Prefer
 def aim(position: ArrayLike, target: ArrayLike, pixel: ArrayLike, intrinsics_px: ArrayLike) -> Array:
     """The pose world_from_camera [4, 4] at `position` [3] that sees `target` [3] at `pixel` (u, v), without roll.
 
-    Nearly above the target, a camera without roll may have to turn far to see it there, or cannot. Then the camera that
-    looks straight at the target is turned as little as possible.
+    If no camera without roll can see it there, as nearly above the target, the one that looks straight at the target is
+    turned as little as possible.
     """
     position, target = np.asarray(position, dtype=np.float64), np.asarray(target, dtype=np.float64)
     ray = pixel_rays(pixel, intrinsics_px)  # camera frame
     towards = unit(target - position)
     reach = np.hypot(ray[1], ray[2])
     pitch = np.arcsin(np.clip(towards[2] / reach, -1.0, 1.0)) - np.arctan2(ray[1], -ray[2])
-    straight = look_at(position, target)
-    if abs(pitch) > np.pi / 2:
-        return pose(turned_onto(straight[:3, :3], ray, towards), position)
+    if abs(towards[2]) > reach or abs(pitch) > np.pi / 2:
+        return pose(turned_onto(look_at(position, target)[:3, :3], ray, towards), position)
     # If the heading is +x: right is -y, up is (-sin pitch, 0, cos pitch), back is -(cos pitch, 0, sin pitch).
     rotation = np.array([[0.0, -np.sin(pitch), -np.cos(pitch)], [-1.0, 0.0, 0.0],
                          [0.0, np.cos(pitch), -np.sin(pitch)]])
     seen = rotation @ ray
     heading = np.arctan2(towards[1], towards[0]) - np.arctan2(seen[1], seen[0])
     turn = np.array([[np.cos(heading), -np.sin(heading), 0.0], [np.sin(heading), np.cos(heading), 0.0], [0, 0, 1.0]])
-    least = turned_onto(straight[:3, :3], ray, towards)
-    return pose(least if rotation_angle(turn @ rotation, least) > TURNED_FAR else turn @ rotation, position)
+    return pose(turn @ rotation, position)
 
 
 def turned_onto(rotation: ArrayLike, ray: ArrayLike, towards: ArrayLike) -> Array:
