@@ -157,7 +157,11 @@ def draw(curves: dict[str, dict[str, Any]], out: Path) -> None:
 
 def _read(path: Path) -> dict[str, Any]:
     """Results from before. Raises SaccadeError if they are none of this benchmark."""
-    results = parse_json(read_text(path, "results", "name another file", MAX_BYTES))
+    text = read_text(path, "results", "name another file", MAX_BYTES)
+    try:
+        results = parse_json(text)
+    except ValueError as error:
+        raise SaccadeError(f"results {path} are damaged ({error}): name another file") from error
     if not (isinstance(results, dict) and results.keys() >= KINDS.keys()):
         raise SaccadeError(f"results {path} are not of this benchmark: name another file")
     return results

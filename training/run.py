@@ -10,6 +10,7 @@ import sys
 import time
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import torch
 from rich.console import Console
@@ -134,7 +135,7 @@ def export(run_dir: Path, weights_dir: Path) -> None:
         if config.architecture == "lexa":  # what only training needs stays behind
             states[part] = {name.removeprefix("actor."): value for name, value in states[part].items()
                             if name.startswith("actor.")}
-        losses[part] = json.loads((run_dir / part / "losses.jsonl").read_text().splitlines()[-1])
+        losses[part] = _told(run_dir / part)[-1]
         commits[part] = facts.get("commit", "unknown")
         seconds += facts["seconds"]
     for name in config.names if config.ccns else ():
@@ -142,7 +143,10 @@ def export(run_dir: Path, weights_dir: Path) -> None:
         losses[name], commits[name] = facts["losses"], facts["commit"]
         seconds += losses[name].get("seconds", 0.0)
     paper = config.architecture == "paper"
-    lived = {"measured": _measured(run_dir / "lexa")} if config.architecture == "lexa" else {}
+    lived = {}
+    if config.architecture == "lexa":
+        keys = ("environment_steps", "goals", "reached", "nearest")
+        lived["measured"] = [{key: row[key] for key in keys} for row in _told(run_dir / "lexa")]
     sizes = {name: load_mesh(config.objects, name).size_m for name in config.names}
     cards = tuple(ObjectCard(name, size, CROP_SIDE_M if paper else crop_side_m(size)) for name, size in sizes.items())
     data = f"{config.views} directions of each object of {config.objects!r}, from {{}}, composed"
@@ -161,8 +165,7 @@ def _export_open(run_dir: Path, config: TrainingConfig, weights_dir: Path) -> No
     networks = weights_dir.parent / (config.networks or NETWORKS)
     if config.parts:
         trained = {part: finished(run_dir, config, part) for part in config.parts}
-        losses = {part: json.loads((run_dir / part / "losses.jsonl").read_text().splitlines()[-1])
-                  for part in config.parts}
+        losses = {part: _told(run_dir / part)[-1] for part in config.parts}
         states = {part: state for part, (_, state) in trained.items()}
         cohort, log_odds = judged(run_dir, config, states)
         write_weights(networks, {**states, COHORT: {"vectors": cohort}}, (), {
@@ -194,10 +197,9 @@ def _calibration(config: TrainingConfig, losses: dict[str, dict]) -> dict[str, f
                     for name, m in measured.items()}
 
 
-def _measured(folder: Path) -> list[dict[str, float]]:
-    """What was measured on goals at each checkpoint of a part of LEXA, against the environment steps until then."""
-    rows = [json.loads(line) for line in (folder / "losses.jsonl").read_text().splitlines()]
-    return [{key: row[key] for key in ("environment_steps", "goals", "reached", "nearest")} for row in rows]
+def _told(folder: Path) -> list[dict[str, Any]]:
+    """The losses and measures of a part at each of its checkpoints."""
+    return [json.loads(line) for line in (folder / "losses.jsonl").read_text().splitlines()]
 
 
 def _where(device: torch.device) -> str:

@@ -7,11 +7,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
+from numpy.typing import ArrayLike
 
 from saccade.app.bench.repeat import Again, Results, replay
-from saccade.app.bench.table import MEASURES, Record, wilson
+from saccade.app.bench.table import MEASURES, Estimate, Record, wilson
 from saccade.app.look.picture import Story, image, new_figure, particles, save, table_from_above, way
 from saccade.app.palette import COLOURS
 from saccade.shared.bus.messages import Belief, Message
@@ -45,16 +47,21 @@ def draw_objects(files: Sequence[Results], out: Path) -> None:
         counts = sorted({r["objects"] for r in file.records})
         groups = [[r["success"] for r in file.records if r["objects"] == count] for count in counts]
         shares = [wilson(sum(group), len(group)) for group in groups]
-        bars = [[100 * (s.value - s.low) for s in shares], [100 * (s.high - s.value) for s in shares]]
         places = np.array(counts) + 0.06 * (k - (len(files) - 1) / 2)
-        axes.errorbar(places, [100 * s.value for s in shares], yerr=np.maximum(bars, 0.0), fmt="o-", capsize=3,
-                      color=colour, label=file.label)
+        _draw_shares(axes, places, shares, colour, file.label)
     axes.set(xlabel="objects on the table", ylabel="success (%)", ylim=(0, 104))
     locator = axes.xaxis.get_major_locator()
     assert isinstance(locator, MaxNLocator)  # every linear axis has one
     locator.set_params(integer=True)
     _legend(figure)
     save(figure, out)
+
+
+def _draw_shares(axes: Axes, places: ArrayLike, shares: Sequence[Estimate], colour: str, label: str) -> None:
+    """Draws shares (%) with their intervals at places along x."""
+    bars = [[100 * (s.value - s.low) for s in shares], [100 * (s.high - s.value) for s in shares]]
+    axes.errorbar(places, [100 * s.value for s in shares], yerr=np.maximum(bars, 0.0), fmt="o-", capsize=3,
+                  color=colour, label=label)
 
 
 def draw_steps(files: Sequence[Results], out: Path) -> None:
@@ -123,9 +130,7 @@ def draw_learning(measured: Sequence[Mapping[str, float]], paper: tuple[float, f
     share, nearest = figure.subplots(1, 2)
     steps = [row["environment_steps"] for row in measured]
     reached = [wilson(round(row["reached"] * row["goals"]), round(row["goals"])) for row in measured]
-    bars = [[100 * (r.value - r.low) for r in reached], [100 * (r.high - r.value) for r in reached]]
-    share.errorbar(steps, [100 * r.value for r in reached], yerr=bars, fmt="o-", capsize=3, color=COLOURS[0],
-                   label="ours, goals that it never learns from")
+    _draw_shares(share, steps, reached, COLOURS[0], "ours, goals that it never learns from")
     share.plot(*paper, "*", color=COLOURS[1], markersize=10, label="the paper's")
     share.set(xlabel="environment steps", ylabel="goals reached (%)", xscale="log", ylim=(0, None))
     share.legend(fontsize=8)

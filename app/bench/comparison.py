@@ -116,7 +116,7 @@ def write_page(out: Path, found: dict[Cell, Results], scenes: dict[Cell, int], c
               f"{core_hours(found, scenes):.1f} hours of one core.", ""]
     room = {cell.agent: results for cell, results in found.items() if cell.suite == ROOM}
     if "lexa" in room:
-        lines += [*_learning("lexa", room["lexa"].objects, out), ""]
+        lines += _learning("lexa", room["lexa"].objects, out)
     if room:
         draw_final_views(_final_views(room, console), out / "final_views.png")
         lines += ["## The views that were reached in the room", "",
@@ -189,7 +189,7 @@ def _learning(agent: str, objects: str, out: Path) -> list[str]:
     return [f"## How {agent} learns", "",
             f"Goals of the room that it never learns from, and that are not the suite's: {measured[-1]['goals']:.0f} "
             "at each point, with Wilson's 95 % intervals. A tolerance, 7.5 cm or 0.5 rad, counts as success.", "",
-            "![Goals reached over environment steps, and how near it comes](learning.png)"]
+            "![Goals reached over environment steps, and how near it comes](learning.png)", ""]
 
 
 def _share(row: Row) -> str:

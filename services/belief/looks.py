@@ -87,7 +87,7 @@ class Looks:
         best = max(self._looks, key=lambda look: look.agreement)
         if len(self._equal_rad) > 1 or best.agreement < WELL:
             return np.zeros(len(self._looks))
-        other = np.array([_between(look.eye, best.eye, center) > OTHER_SIDE_RAD for look in self._looks])
+        other = _between(np.array([look.eye for look in self._looks]), best.eye, center) > OTHER_SIDE_RAD
         less = np.array([best.agreement - look.agreement for look in self._looks])
         return np.asarray(other * np.minimum(PER_LESS * less, AT_MOST))
 
@@ -108,10 +108,10 @@ def _way(up: Array, around: Array, elevation: Array) -> Array:
     return np.sqrt(up ** 2 + around ** 2 * (np.cos(elevation) ** 2 + (TURNED * np.sin(elevation)) ** 2))
 
 
-def _between(eye: Array, other: Array, center: Array) -> float:
-    """How far the views from two positions [3] of an object at `center` [3] (m) are apart (rad)."""
-    (azimuth, elevation, _), (azimuth_there, elevation_there, _) = spherical(eye, center), spherical(other, center)
-    return float(_way(elevation_there - elevation, wrap(azimuth_there - azimuth), elevation))
+def _between(eyes: Array, other: Array, center: Array) -> Array:
+    """How far the views from positions [..., 3] of an object at `center` [3] (m) are from one from another [3], rad."""
+    (azimuth, elevation, _), (azimuth_there, elevation_there, _) = spherical(eyes, center), spherical(other, center)
+    return _way(elevation_there - elevation, wrap(azimuth_there - azimuth), elevation)
 
 
 def _near(way: Array) -> Array:

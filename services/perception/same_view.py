@@ -3,8 +3,10 @@
 Latent poses hold crops of 64 pixels, and the front and the back of a label may look alike in them. So the goal's object
 is also compared by local features (`local_features.py`), where the goal's view may be: where it is about as large and
 about at the same place in the image. Features of both crops that are alike belong together, and in views from the same
-direction nearly all of these pairs follow from one affine map that is not far from the identity. Laid over each other
-by this map, the crops must have the same colours (`colours.py`), which local features do not see.
+direction nearly all of these pairs follow from a smooth map that is not far from the identity: each is shifted as an
+affine map tells that is fitted to the pairs near it, so that the faces of a box may each be shifted in their way. Laid
+over each other, the crops must have the same colours (`colours.py`), which local features do not see. How the surface
+is shifted as a whole tells where the goal's view is.
 """
 
 from __future__ import annotations

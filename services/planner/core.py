@@ -242,11 +242,12 @@ class Planner:
     def _note_rivals(self, beliefs: dict[str, Belief]) -> None:
         """Keeps in mind which directions are likely now, and whether views are compared. Views that look the same are
         no rivals."""
-        if self.preference is not None:
-            self.compared |= beliefs[self.preference.target].goal_agreement is not None
-        if self.preference is not None and self.config.planner.retry \
-                and self.symmetry[self.preference.target] == NONE:
-            self.now.rivals.take(beliefs[self.preference.target])
+        if self.preference is None:
+            return
+        target = beliefs[self.preference.target]
+        self.compared |= target.goal_agreement is not None
+        if self.config.planner.retry and self.symmetry[target.object] == NONE:
+            self.now.rivals.take(target)
 
     def _evidence(self, target: Belief, camera: Array) -> Evidence:
         fused = fused_here(target, camera, self.symmetry[target.object])
