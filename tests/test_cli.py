@@ -123,6 +123,7 @@ def test_topics_lists_the_registry(monkeypatch, capsys):
     (("run", "--agent", "nobody"), "agent 'nobody' is unknown: choose from sceneccn, paper"),
     (("run", "--agent", "oracle"), "add `--bus local`"),
     (("run", "--weights", "none"), "none/manifest.json are missing: train them"),
+    (("run", "--agent", "posecnn"), "`saccade train --objects pantry --architecture posecnn`"),
     (("run", "--agent", "oracle", "--bus", "local", "--scene", "s1"), "scene.scene needs scene.file"),
     (("run", "--agent", "oracle", "--bus", "local", "--goal", "none.png"), "goal image"),
     (("bench", "--agent", "oracle", "--scenes", PAPER_SCENES), "is not in use: choose the set that has it"),

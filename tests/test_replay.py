@@ -11,11 +11,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from saccade.app.log.check import missing
 from saccade.app.replay.comparison import Comparison, differences
 from saccade.app.replay.replay import REPLAYABLE
 from saccade.app.replay.tolerances import TOLERANCES, tolerance_of
+from saccade.app.run.registry import configuration
 from saccade.app.run.run import run
 from saccade.shared.bus.messages import field_types
 from saccade.shared.bus.topics import (
@@ -173,6 +175,16 @@ def test_nothing_to_compare_is_no_success(tmp_path):
     assert done.returncode == 1
     assert "0 answers compared" in done.stdout
     assert "nothing could be compared: play more of the log" in done.stdout
+
+
+def test_a_service_that_the_recorded_run_did_without_is_told(tmp_path):
+    config, agent = configuration(None, {"scene.names": ["soup_can"], "simulator.max_steps": 2, "bus.kind": "local"},
+                                  "random-walk")
+    run(config, agent=agent, out=tmp_path / "walk", plain=True, console=Console(quiet=True))
+    done = saccade(tmp_path / "walk", "--into", "perception,planner", "--bus", "local", "--out", tmp_path / "replay")
+    assert "nothing of perception is in what was played: either the recorded run had no such service" in done.stdout
+    assert "0 differ in a byte" in done.stdout
+    assert "only now" not in done.stdout
 
 
 def test_key_presses_give_one_message_each(tmp_path):

@@ -50,8 +50,9 @@ class Comparison:
     unequal: int = 0  # pairs that differ in a byte
     beyond: int = 0  # pairs that differ beyond what is tolerated
     differences: list[Difference] = field(default_factory=list)
-    # Called with topic, part, recorded and replayed message of every pair
+    topics: set[str] = field(default_factory=set)  # of which the recording has messages
     not_compared: list[At] = field(default_factory=list)  # of steps of which a damaged log lacks a part
+    # Called with topic, part, recorded and replayed message of every pair
     on_pair: Callable[[Topic, str | None, Message, Message], None] | None = None
     _recorded: dict[At, tuple[Topic, bytes]] = field(default_factory=dict)
     _replayed: dict[At, tuple[Topic, bytes]] = field(default_factory=dict)
@@ -59,6 +60,7 @@ class Comparison:
     def recorded(self, topic: Topic, part: str | None, payload: bytes) -> list[Difference]:
         """Takes the wire bytes of a recorded message. Returns the differences if the replayed one is there, else
         none."""
+        self.topics.add(topic.name)
         return self._take(self._recorded, self._replayed, topic, part, payload)
 
     def replayed(self, topic: Topic, part: str | None, payload: bytes) -> list[Difference]:

@@ -16,7 +16,7 @@ from rich.table import Table
 
 from saccade.app.log.check import abbreviated, missing
 from saccade.app.log.cut import require_steps
-from saccade.app.replay.comparison import At
+from saccade.app.replay.comparison import At, Comparison
 from saccade.app.replay.displacement import Moved
 from saccade.app.replay.replay import Outcome, Replay, prepare, replay_here, replay_on_bus
 from saccade.app.run.display import say
@@ -150,20 +150,33 @@ def tell(replay: Replay, outcome: Outcome, console: Console) -> None:
         note(f"  {difference}")
     if comparison.beyond > TOLD:
         note(f"  ... {comparison.beyond} messages in all")
-    for what, only in (("only in the recording", comparison.only_recorded), ("only now", comparison.only_replayed)):
+    unpaired = _unpaired(replay, comparison)
+    only_now = [at for at in comparison.only_replayed if at[0] not in unpaired]
+    for what, only in (("only in the recording", comparison.only_recorded), ("only now", only_now)):
         for topic, part, episode, step in only[:TOLD]:
             note(f"  {what}: {topic}{f'/{part}' if part else ''} of step {step} of episode {episode}")
         if len(only) > TOLD:
             note(f"  ... {len(only)} messages are {what}")
     for line in not_compared(comparison.not_compared):
         note(f"  {line}")
-    if not comparison.compared:
+    for name in sorted(set(unpaired.values())):
+        note(f"  nothing of {name} is in what was played: either the recorded run had no such service, or the log "
+             "has lost its messages; what it says now is in the replay's log")
+    if not comparison.compared and len(set(unpaired.values())) < len(replay.into):
         remedy = ("give a log that is whole" if comparison.not_compared
                   else "play more of the log, or more of its topics")
         note(f"  nothing could be compared: {remedy}")
     if replay.pace.rate is not None and outcome.late_s > 0.1:
         note(f"  the services were too slow for {replay.pace.rate:g} x: up to {outcome.late_s:.1f} s behind")
     _tell_losses(outcome, console)
+
+
+def _unpaired(replay: Replay, comparison: Comparison) -> dict[str, str]:
+    """By topic, the services that speak now and of which the recording holds nothing."""
+    now = {at[0] for at in comparison.only_replayed}
+    made = {service.name: {topic.name for topic in service.outputs} for service in replay.services}
+    return {topic: name for name, topics in made.items() if topics & now and not topics & comparison.topics
+            for topic in topics}
 
 
 def not_compared(ats: Sequence[At]) -> Iterator[str]:

@@ -201,8 +201,10 @@ def _file_name(name: str) -> str:
 def weights_in_use(config: Config) -> Weights:
     """The weights that a configuration names. Raises SaccadeError if they are missing or damaged."""
     objects, is_open = told(config.scene.objects), config.perception.architecture == OPEN
-    if set_folder(config.scene.objects) is None or config.perception.weights is not None:
+    if config.perception.weights is not None:
         return Weights(config.weights)
+    if set_folder(config.scene.objects) is None:
+        return _built_in(config)
     learn = f"`saccade objects learn --set {config.scene.objects}`"
     if not (config.weights / MANIFEST).is_file():
         raise SaccadeError(f"object set {objects} is not learnt: {learn}" if is_open else
@@ -215,6 +217,15 @@ def weights_in_use(config: Config) -> Weights:
     if is_open and lacking:
         raise SaccadeError(f"object {told(lacking[0])} of the set {objects} is not learnt: {learn}")
     return weights
+
+
+def _built_in(config: Config) -> Weights:
+    """The weights that come with a built-in set. Where they are missing, the line says how they are trained."""
+    if not (config.weights / MANIFEST).is_file():
+        raise SaccadeError(f"weights {config.weights / MANIFEST} are missing: train them with `saccade train --objects "
+                           f"{config.scene.objects} --architecture {config.perception.architecture}`, or name others "
+                           "with --weights")
+    return Weights(config.weights)
 
 
 def bank_file(name: str) -> str:
