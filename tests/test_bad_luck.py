@@ -56,8 +56,8 @@ def last(told, topic):
 
 @pytest.fixture(scope="module")
 def results(agent, world, scenes):
-    """Ten ordinary scenes with turned objects, ended by the agent's own word or after 80 steps."""
-    return [last(play(agent, world, scene, max_steps=80, until="declared"), "result") for scene in scenes]
+    """Ten ordinary scenes with turned objects, ended by the agent's own word or after 40 steps."""
+    return [last(play(agent, world, scene, max_steps=40, until="declared"), "result") for scene in scenes]
 
 
 def test_the_agent_reaches_most_goals(results):
@@ -170,8 +170,8 @@ def test_free_energy_falls_as_beliefs_sharpen(agent, world, scenes):
     though by then no fewer objects are in sight."""
     totals, sights = [], []
     for scene in [s for s in scenes if len(s.objects) == 3]:
-        told = play(agent, world, scene, max_steps=30, explore=True)
-        total, seen = np.zeros(30), np.zeros(30)
+        told = play(agent, world, scene, max_steps=15, explore=True)
+        total, seen = np.zeros(15), np.zeros(15)
         for _, m in told["belief"]:
             total[m.step] += m.f_identity + m.f_position + m.f_crop + m.f_pose + m.f_likelihood
             seen[m.step] += m.f_likelihood > 0

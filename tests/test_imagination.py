@@ -38,7 +38,7 @@ def weights(mesh, tmp_path_factory):
     torch.manual_seed(0)
     folder = tmp_path_factory.mktemp("weights") / "own"
     card = ObjectCard(mesh.name, mesh.size_m, crop_side_m(mesh.size_m))
-    bank = bank_from(mesh, ViewEncoder().eval(), LocalFeatures(), count=400)
+    bank = bank_from(mesh, ViewEncoder().eval(), LocalFeatures(), count=100)
     write_weights(folder, {}, (card,), {"architecture": "open", "networks": "open"}, {mesh.name: bank.arrays()})
     return Weights(folder)
 

@@ -113,7 +113,8 @@ def test_the_labels_of_a_rendered_image_are_the_poses_of_its_objects():
     assert checked > 3
 
 
-def test_training_continues_as_if_it_had_not_been_interrupted_and_its_weights_serve(tmp_path):
+def test_training_continues_as_if_it_had_not_been_interrupted_and_its_weights_serve(tmp_path, monkeypatch):
+    monkeypatch.setattr("saccade.training.posecnn.EVALUATED", 10)
     for name, interrupted in (("whole", 4), ("resumed", 3)):
         start(tmp_path / name, TINY)
         if interrupted == 4:

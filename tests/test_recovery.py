@@ -131,7 +131,7 @@ def test_a_service_that_hangs_for_long_is_ended_and_started_again(tmp_path, monk
 
 def test_a_launcher_that_was_suspended_blames_nobody(tmp_path):
     run_dir = tmp_path / "run"
-    launcher = subprocess.Popen([sys.executable, "-m", "saccade.tests.fakes.launch", str(run_dir), "1", "3000"],
+    launcher = subprocess.Popen([sys.executable, "-m", "saccade.tests.fakes.launch", str(run_dir), "1", "1000"],
                                 stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     try:
         while "recorder" not in processes_of(run_dir):

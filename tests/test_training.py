@@ -16,6 +16,7 @@ from saccade.training.crops import CropComposer
 from saccade.training.dataset import load_views
 from saccade.training.frames import FrameComposer
 from saccade.training.part import Trainer, pick_device
+from saccade.training.precision import reduced_precision
 from saccade.training.run import export, start, train
 from saccade.training.settings import EXTRACTION, TrainingConfig
 from saccade.training.strangers import recoloured
@@ -157,3 +158,10 @@ def test_damaged_views_and_checkpoints_are_told(finished, tmp_path):
 def test_a_gpu_that_is_not_there_is_told():
     with pytest.raises(SaccadeError, match="--device cpu"):
         pick_device("cuda")
+
+
+def test_a_processor_learns_in_a_precision_that_it_computes_in():
+    """Imitated bfloat16 costs many times what it saves."""
+    with reduced_precision(torch.device("cpu")):
+        product = torch.ones(2, 2) @ torch.ones(2, 2)
+    assert (product.dtype == torch.bfloat16) == torch.ops.mkldnn._is_mkldnn_bf16_supported()

@@ -113,7 +113,7 @@ def identity_loss(identity: Identity, batch: CropBatch) -> Tensor:
 
 @torch.inference_mode()
 def goal_search_errors(ccn: CCN, composer: CropComposer, held_out: Tensor, generator: torch.Generator, *,
-                       pairs: int = 150, jitter: float = 1.0) -> np.ndarray:
+                       pairs: int, jitter: float = 1.0) -> np.ndarray:
     """Errors [pairs] (great circle, radians) of the goal direction that the CCN finds, for held-out directions.
 
     For each pair of composed crops, the transition moves the latent pose of the first crop to every cell of a grid of

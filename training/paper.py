@@ -20,8 +20,9 @@ from saccade.training.extraction import HIDDEN, SEEN, errors
 from saccade.training.frames import FrameBatch
 from saccade.training.paper_data import CleanViews, PaperFrames
 from saccade.training.pictures import draw_paper_extraction
+from saccade.training.precision import reduced_precision
 from saccade.training.settings import TrainingConfig
-from saccade.training.tasks import CcnTask, generator_of, on_device, split
+from saccade.training.tasks import EVALUATED_EACH, CcnTask, generator_of, on_device, split
 
 KL_TRANSITION = 10.0  # lambda_4 in the paper's table of the optimisation
 MASKING, CROPPING, IDENTIFICATION = 10.0, 10.0, 10.0  # weights of errors summed over 64 x 64 x 3, as in phase 1
@@ -30,7 +31,7 @@ SUMMED = 3 * CROP_PX ** 2
 # the mask network would learn to cut nothing out.
 KL_FROM = 0.3
 GUIDE_END = 0.3  # share of the guide's weight that is left at the end
-EVALUATED = 400  # number of images in an evaluation
+EVALUATED = 400  # number of images in an evaluation, where there are directions enough
 
 
 class PaperCcnTask(CcnTask):
@@ -46,7 +47,7 @@ class PaperCcnTask(CcnTask):
         """The loss at a step, and its parts."""
         generator = self.generator(step)
         pair = sample_pair(self.composer, self.train_index, self.config.batch_ccn, generator)
-        with torch.autocast(self.device.type, dtype=torch.bfloat16):
+        with reduced_precision(self.device):
             return loss_l1(self.ccn, pair, self.lambdas, generator, kl_transition=KL_TRANSITION, halves=False)
 
 
@@ -90,7 +91,7 @@ class PaperExtractionTask:
         done, config = step / self.config.steps_extraction, self.config
         expected = self._expected(first, second, generator) if config.kl_extraction and done >= self.kl_from else None
         guide = config.guide_extraction * GUIDE_END ** done
-        with torch.autocast(self.device.type, dtype=torch.bfloat16):
+        with reduced_precision(self.device):
             return loss_l2(self.module, self.ccn, batch, clean, expected, kl=config.kl_extraction, guide=guide)
 
     @torch.no_grad()
@@ -112,7 +113,8 @@ class PaperExtractionTask:
     def evaluate(self) -> dict[str, float]:
         """Errors of the networks on images of held-out directions that are always the same, see `errors`."""
         generator = self.generator(2 ** 31)
-        batch = self.frames.compose(self._pick(self.held_out, EVALUATED, generator), generator)
+        count = min(EVALUATED, EVALUATED_EACH * len(self.held_out))
+        batch = self.frames.compose(self._pick(self.held_out, count, generator), generator)
         _, center, scale, _, logit = self.module(batch.image)
         return errors(logit[:, None], (center[:, None] + 1) / 2, scale.log()[:, None], batch)
 

@@ -25,6 +25,7 @@ from saccade.shared.render.objects import load_mesh
 from saccade.shared.render.views import crop_side_m
 from saccade.shared.world.geometry import IMAGE_SIZE_PX, INTRINSICS_PX
 from saccade.training.pictures import draw_poses
+from saccade.training.precision import reduced_precision
 from saccade.training.rendered import RenderedBatch, RenderedScenes
 from saccade.training.settings import TrainingConfig
 from saccade.training.tasks import on_device
@@ -72,7 +73,7 @@ class PoseCnnTask:
         """The loss at a step, and its parts."""
         batch = self._next(step)
         generator = torch.Generator(self.device).manual_seed(step)
-        with torch.autocast(self.device.type, dtype=torch.bfloat16):
+        with reduced_precision(self.device):
             labels, votes, features = self.module(batch.input.contiguous(memory_format=torch.channels_last))
             found = torch.nonzero(batch.seen >= SEEN_CELLS)
             quaternion = self._quaternions(features, batch, found, generator)

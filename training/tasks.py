@@ -18,9 +18,11 @@ from saccade.training.crops import CropComposer
 from saccade.training.extraction import extraction_errors, loss_l2
 from saccade.training.frames import FrameComposer
 from saccade.training.pictures import draw_ccn, draw_extraction
+from saccade.training.precision import reduced_precision
 from saccade.training.settings import TrainingConfig
 
 IDENTITY_WEIGHT = 50.0  # of the identity network's loss
+EVALUATED_EACH = 4  # an evaluation uses no held-out direction more often, on average
 
 Network = TypeVar("Network", bound=nn.Module)
 
@@ -81,7 +83,7 @@ class CcnTask:
             pair = sample_pair(self.composer, self.train_index, batch, generator, clean=clean)
             mixed = self.composer.compose(pick(batch // 2), generator, present=0.25)
             present = self.composer.compose(pick(batch), generator) if clean else pair.first
-        with torch.autocast(self.device.type, dtype=torch.bfloat16):
+        with reduced_precision(self.device):
             loss, parts = loss_l1(self.ccn, pair, self.lambdas, generator)
             judge = self.module["identity"]
             assert isinstance(judge, Identity)
@@ -95,7 +97,8 @@ class CcnTask:
 
     def evaluate(self) -> dict[str, float]:
         """Errors of the goal direction on held-out directions: the median (radians), and shares below two limits."""
-        errors = goal_search_errors(self.ccn, self.composer, self.held_out, self.generator(2 ** 31), jitter=0.4)
+        errors = goal_search_errors(self.ccn, self.composer, self.held_out, self.generator(2 ** 31), jitter=0.4,
+                                    pairs=min(150, EVALUATED_EACH * len(self.held_out)))
         return {"goal_median_rad": float(np.median(errors)), "goal_within_0.19": float((errors < 0.19).mean()),
                 "goal_within_0.5": float((errors < 0.5).mean())}
 
@@ -113,20 +116,21 @@ class ExtractionTask:
         self.module = on_device(Extraction(len(views)), device)
         self.config, self.device = config, device
         self.lambdas: list[float] = []
+        self._evaluated = min(200, EVALUATED_EACH * sum(len(v.azimuth_rad) for v in views) // 10)
 
     def loss(self, step: int) -> tuple[Tensor, dict[str, float]]:
         """The loss at a step, and its parts."""
         batch = self.composer.compose(self.config.batch_extraction, np.random.default_rng([self.config.seed, step]))
-        with torch.autocast(self.device.type, dtype=torch.bfloat16):
+        with reduced_precision(self.device):
             return loss_l2(self.module, batch)
 
     def after(self, step: int, smoothed: dict[str, float]) -> None:
         """Does nothing, because this task has no weights that adapt."""
 
     def evaluate(self) -> dict[str, float]:
-        """Errors of the network on 200 images that are always the same, see `errors`."""
+        """Errors of the network on at most 200 images that are always the same, see `errors`."""
         rng = np.random.default_rng([self.config.seed, 2 ** 31])
-        return extraction_errors(self.module, self.composer.compose(200, rng))
+        return extraction_errors(self.module, self.composer.compose(self._evaluated, rng))
 
     def draw(self, path: Path) -> None:
         """Saves sample pictures."""

@@ -23,6 +23,7 @@ from saccade.training.lexa.world_model import (
     patched,
 )
 from saccade.training.pictures import draw_rows
+from saccade.training.precision import reduced_precision
 from saccade.training.settings import TrainingConfig
 from saccade.training.tasks import generator_of, on_device
 
@@ -55,11 +56,11 @@ class LexaTask:
         generator = generator_of(self.config, self.part, self.device, step)
         batch = self.replay.sequences(self.config.batch_extraction, SEQUENCE, rng, self.device)
         learner = self.module
-        with torch.autocast(self.device.type, dtype=torch.bfloat16):
+        with reduced_precision(self.device):
             encodings = learner.actor.encoder(batch.images.flatten(0, 1)).unflatten(0, batch.images.shape[:2])
         encodings = encodings.float()
         states, posterior, prior = observe(learner.actor.model, encodings, batch.actions, generator)
-        with torch.autocast(self.device.type, dtype=torch.bfloat16):
+        with reduced_precision(self.device):
             model, parts = model_loss(learner, batch, encodings, states, posterior, prior, generator)
             spread = ensemble_loss(learner, states, batch.actions, encodings)
             chosen = torch.randperm(SEQUENCE, generator=generator, device=self.device)[:AIMED]

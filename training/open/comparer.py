@@ -18,6 +18,7 @@ from saccade.training.open.composer import Crops
 from saccade.training.open.encoder import Banks, batch
 from saccade.training.open.material import Material
 from saccade.training.pictures import draw_pairs
+from saccade.training.precision import reduced_precision
 from saccade.training.settings import TrainingConfig
 from saccade.training.tasks import on_device
 
@@ -57,7 +58,7 @@ class ComparerTask:
     def loss(self, step: int) -> tuple[Tensor, dict[str, float]]:
         """The loss at a step, and its parts."""
         drawn = self.pairs(step, self.config.batch_ccn)
-        with torch.autocast(self.device.type, dtype=torch.bfloat16):
+        with reduced_precision(self.device):
             compared = Compared(self.comparison(drawn.seen, drawn.known))
         return comparing(compared, drawn)
 
@@ -136,7 +137,7 @@ def pairs(material: Material, encoder: ViewEncoder, banks: Banks, among: Tensor,
 
 
 def _similar(encoder: ViewEncoder, crops: Tensor, vectors: Tensor) -> Tensor:
-    with torch.autocast(crops.device.type, dtype=torch.bfloat16):
+    with reduced_precision(crops.device):
         seen = encoder(crops)
     return seen @ vectors.T
 

@@ -18,6 +18,7 @@ from saccade.services.perception.view_encoder import ViewEncoder
 from saccade.training.open.composer import Crops
 from saccade.training.open.material import Material
 from saccade.training.pictures import draw_pairs
+from saccade.training.precision import reduced_precision
 from saccade.training.settings import TrainingConfig
 from saccade.training.tasks import on_device
 
@@ -55,7 +56,7 @@ class EncoderTask:
             self.encoder.train()
         rng = np.random.default_rng([self.config.seed, 1, step])
         crops = batch(self.material, self.config.batch_ccn, rng)
-        with torch.autocast(self.device.type, dtype=torch.bfloat16):
+        with reduced_precision(self.device):
             seen, known = self.encoder(crops.seen), self.encoder(crops.known)
         sharpness = self.encoder.log_sharpness.exp()
         among, parts = contrast(seen, known, crops, sharpness)
@@ -136,7 +137,7 @@ class Banks:
         which = np.repeat(numbers, maker.views[numbers])
         index = np.concatenate([np.arange(count) for count in maker.views[numbers]])
         for part in np.array_split(np.arange(len(which)), -(-len(which) // AT_A_TIME)):
-            with torch.autocast(maker.device.type, dtype=torch.bfloat16):
+            with reduced_precision(maker.device):
                 vectors.append(encoder(maker.known(which[part], index[part])))
         self.maker, self.index = maker, index
         self.vectors, self.owner = torch.cat(vectors), torch.as_tensor(which, device=maker.device)

@@ -18,6 +18,7 @@ from saccade.shared.world.geometry import project
 from saccade.training.open.composer import uniform_of
 from saccade.training.open.table_crops import INTRINSICS, Sights, TableCrops
 from saccade.training.open.tables import FRAME_PX, MOST
+from saccade.training.precision import reduced_precision
 from saccade.training.settings import TrainingConfig
 from saccade.training.tasks import on_device
 
@@ -59,7 +60,7 @@ class ProposerTask:
         rng = np.random.default_rng([self.config.seed, 3, step])
         chosen = rng.integers(len(self.tables.rgb), size=self.config.batch_extraction)
         image, targets = images(self.tables, self.circles, chosen, rng, self.device)
-        with torch.autocast(self.device.type, dtype=torch.bfloat16):
+        with reduced_precision(self.device):
             foreground, votes = self.proposer(image.contiguous(memory_format=torch.channels_last))
         said = ~targets.foreground.isnan()
         shown = (targets.foreground == 1.0) & said
