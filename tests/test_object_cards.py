@@ -16,12 +16,15 @@ from saccade.app.objects.learning import Learnt
 from saccade.app.objects.showing import show_object
 from saccade.app.objects.store import keep, obj_text, own_folder
 from saccade.app.run.registry import configuration
+from saccade.services.simulator.scenes import save_scenes
+from saccade.services.simulator.suites import SUITES
+from saccade.services.simulator.tables import draw_tables
 from saccade.shared.config import learned_folder
 from saccade.shared.errors import SaccadeError
 from saccade.shared.files import parse_toml, remedy, writing
 from saccade.shared.model.object_card import CARD, symmetry_in
 from saccade.shared.model.weights import MANIFEST, OPEN
-from saccade.shared.render.objects import load_mesh
+from saccade.shared.render.objects import load_mesh, names_of
 from saccade.shared.world.symmetry import CONTINUOUS, NONE
 from saccade.tests.fakes.shapes import box, can, labelled
 from saccade.tests.front_door import call
@@ -164,6 +167,18 @@ def test_in_other_light_and_for_photographs_it_is_the_agent_that_was_made_for_th
     assert configured(None, keys | {"perception.weights": tmp_path}, None, None)[1] == "sceneccn"
     assert configured(None, {"simulator.look": "flat", "simulator.goal_look": "flat"}, None, None)[1] == "sceneccn"
     assert capsys.readouterr().out == ""
+
+
+def test_for_objects_that_lie_it_is_too(tmp_path, capsys):
+    meshes = {name: load_mesh("pantry", name) for name in names_of("pantry")}
+    assert {name for name, suite in SUITES.items() if suite.place is not None and any(
+        scene.lying for scene in draw_tables(name, meshes, 0, 11 if name == "moving" else 2))} == {
+            name for name, suite in SUITES.items() if suite.lying}
+    for number, agent in ((0, "sceneccn"), (10, "open")):  # it is moved, pushed over
+        save_scenes(path := tmp_path / f"{number}.json", [draw_tables("moving", meshes, 0, 11)[number]])
+        assert configured(None, {"scene.file": path}, None, None)[1] == agent
+    assert configured(None, {}, None, None, lying=True)[1] == "open"
+    assert capsys.readouterr().out.count("it is the one for objects that lie or fall") == 2
 
 
 def test_in_python_too(home):

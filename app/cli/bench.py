@@ -51,8 +51,9 @@ def bench(*, objects: Objects = None, scenes: ScenesFile = None,
     from saccade.services.simulator.suites import SUITES
 
     of_suite = dict(SUITES[suite].values) if suite in SUITES else {}
+    lying = suite in SUITES and SUITES[suite].lying
     resolved, agent = configured(config, {"scene.objects": objects, "scene.file": scenes, "seed": seed,
-                                          "perception.weights": weights} | of_suite, values, agent)
+                                          "perception.weights": weights} | of_suite, values, agent, lying=lying)
     if yaw is not None and (resolved.scene.file is not None or suite is not None):
         raise SaccadeError("--yaw is for scenes that are drawn: leave it or --scenes and --suite out")
     if yaw is not None:

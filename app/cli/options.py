@@ -12,7 +12,7 @@ import typer
 # A test holds this to the registry, which loads too much for a help text.
 AGENTS = ("sceneccn (Saccade's own), paper, open, posecnn, posecnn-infogain, render-and-compare, lexa, random-walk, "
           "still, or oracle (which knows the goal's pose)")
-AGENT_DEFAULT = "sceneccn, or open for objects of your own, photographs and any other light"
+AGENT_DEFAULT = "sceneccn, or open for objects of your own or that lie, photographs and any other light"
 Objects = Annotated[str | None, typer.Option(
     help="Object set: pantry, ycb, one of your own, or the folder of one; or a list such as milk,pantry:soup_can.",
     metavar="SET", show_default="pantry")]

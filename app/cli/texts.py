@@ -10,23 +10,24 @@ from saccade.shared.errors import SaccadeError
 
 
 def configured(path: Path | None, given: dict[str, Any], values: list[str] | None,
-               agent: str | None) -> tuple[Any, str]:
+               agent: str | None, *, lying: bool = False) -> tuple[Any, str]:
     """The configuration and the name of its agent: the agent's preset, over it the file's, then the options that were
-    given, then `--set`. Without an agent it is the one for such objects and such light; this is said if
-    it is not the usual one.
+    given, then `--set`. Without an agent it is the one for such objects and such light, and for objects that lie where
+    a suite has such; this is said if it is not the usual one.
 
     Raises SaccadeError if the agent is unknown, or if a file, a key or a value is wrong.
     """
     from saccade.app.run.registry import configuration, reason_for_open
 
     options = {key: value for key, value in given.items() if value is not None}
-    config, name = configuration(path, options | dict(map(parse_value, values or ())), agent)
+    config, name = configuration(path, options | dict(map(parse_value, values or ())), agent,
+                                 lying=lying)
     if is_list(config.scene.objects):
         from saccade.app.objects.lists import assembled
 
         objects = assembled(config.scene.objects, config.perception.architecture)
         config = config.with_values({"scene.objects": objects})
-    if agent is None and (why := reason_for_open(config)):
+    if agent is None and (why := reason_for_open(config, lying)):
         from saccade.shared.render.objects import names_of
 
         names_of(config.scene.objects)  # a name that is misspelt is told first

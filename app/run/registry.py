@@ -77,20 +77,21 @@ def agent_of(name: str) -> Agent:
     return AGENTS[name]
 
 
-def configuration(path: Path | None, keys: Mapping[str, Any], agent: str | None = None) -> tuple[Config, str]:
+def configuration(path: Path | None, keys: Mapping[str, Any], agent: str | None = None, *,
+                  lying: bool = False) -> tuple[Config, str]:
     """The configuration and the name of its agent: the agent's preset, over it the file, over it the dotted keys.
 
     Without the name of an agent it is `sceneccn`, or `open` where there is a reason for it (`reason_for_open`). Raises
     SaccadeError if the agent is unknown, or if the file, a key or a value is wrong.
     """
     if agent is None:
-        agent = DEFAULT_AGENT if reason_for_open(load_config(path).with_values(dict(keys))) is None else OPEN
+        agent = DEFAULT_AGENT if reason_for_open(load_config(path).with_values(dict(keys)), lying) is None else OPEN
     return load_config(path, agent_of(agent).preset).with_values(dict(keys)), agent
 
 
-def reason_for_open(config: Config) -> str | None:
+def reason_for_open(config: Config, lying: bool = False) -> str | None:
     """Why the agent `open` is the one for this configuration. None if `sceneccn` is, which knows the built-in objects
-    in flat light, or the given weights."""
+    in flat light, or the given weights. `lying` says that objects may lie, as in some suites."""
     if config.perception.weights is not None:
         return None
     if config.scene.objects not in BUILT_IN_SETS:
@@ -99,7 +100,16 @@ def reason_for_open(config: Config) -> str | None:
         return "it is the one for photographs"
     if (config.simulator.look, config.simulator.goal_look or FLAT_LOOK) != (FLAT_LOOK, FLAT_LOOK):
         return "it is the one for any light"
+    if lying or (config.scene.file is not None and _lie_in(config.scene.file)):
+        return "it is the one for objects that lie or fall"
     return None
+
+
+def _lie_in(scenes: Path) -> bool:
+    """Whether objects lie, or will, in a scenes file. Raises SaccadeError if it is missing or damaged."""
+    from saccade.services.simulator.scenes import load_scenes  # here, because most runs have no such file
+
+    return any(scene.lying for scene in load_scenes(scenes))
 
 
 def world_of(name: str) -> World:

@@ -182,6 +182,11 @@ class Scene:
         return tuple(p for p in self.objects if not (self.target_absent and p.name == self.target))
 
     @property
+    def lying(self) -> bool:
+        """Whether an object does not stand upright, or will not after an event."""
+        return not all(p.upright for p in (*self.objects, *(e.to for e in self.events if e.to is not None)))
+
+    @property
     def is_plain(self) -> bool:
         """Whether it is a scene as the paper's: each object stands upright, is there once, and nothing happens."""
         return self.workspace is None and not self.events and all(p.upright and p.instance == 1 for p in self.objects)

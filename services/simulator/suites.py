@@ -10,7 +10,7 @@ from typing import Literal
 
 from saccade.services.simulator.scene import Scene
 from saccade.services.simulator.scenes import PAPER_SCENES, Sizes, generate_split, load_scenes, room_scenes
-from saccade.services.simulator.tables import TABLES, draw_tables
+from saccade.services.simulator.tables import LYING, TABLES, draw_tables
 from saccade.shared.errors import SaccadeError
 from saccade.shared.render.mesh import Mesh
 
@@ -28,13 +28,14 @@ DEV_REPEATS = 2  # repeats in each half
 class Suite:
     """Scenes that `draw(sizes, seed of the run)` makes, or `place(meshes, seed of the run)`, which needs the objects'
     shapes, or the scenes of a file, which belong to one object set. `values` are keys of the configuration that belong
-    to the suite, too."""
+    to the suite, too. `lying` says that its objects may lie on their sides."""
 
     draw: Callable[[Sizes, int], list[Scene]] | None = None
     place: Callable[[Mapping[str, Mesh], int], list[Scene]] | None = None
     file: Path | None = None
     objects: str | None = None
     values: Mapping[str, str] = field(default_factory=dict)
+    lying: bool = False
 
     def scenes(self, meshes: Mapping[str, Mesh], seed: int) -> list[Scene]:
         """The scenes for these objects. Raises SaccadeError if they do not fit on the table, or if the file is of
@@ -64,7 +65,7 @@ SUITES = {
     "dev": Suite(_dev),
     "paper-like": Suite(lambda sizes, seed: _split(sizes, seed, "fixed")),
     "paper-like-yaw": Suite(lambda sizes, seed: _split(sizes, seed, "random")),
-} | {kind: Suite(place=functools.partial(draw_tables, kind)) for kind in TABLES}
+} | {kind: Suite(place=functools.partial(draw_tables, kind), lying=kind in LYING) for kind in TABLES}
 
 
 def suite_of(name: str, objects: str) -> Suite:

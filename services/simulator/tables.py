@@ -183,6 +183,8 @@ def _anywhere(rng: Generator, meshes: Meshes, target: str, _number: int) -> Scen
 TABLES: dict[str, Callable[[Generator, Meshes, str, int], Scene | None]] = {
     "twins": _twins, "lying": _lying, "moving": _moving, "drifting": _drifting, "crowd": _crowd, "anywhere": _anywhere}
 
+LYING = ("lying", "moving", "crowd")  # in which objects do not all stand
+
 
 def _any_reach(rng: Generator, table: Table) -> Reach:
     """A box above the table, or the shell that an arm beside it reaches."""
