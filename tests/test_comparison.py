@@ -19,6 +19,14 @@ from saccade.shared.errors import SaccadeError
 AGENTS = ("random-walk", "still")
 
 
+@pytest.fixture(scope="module", autouse=True)
+def short_episodes():
+    whole = comparison._configuration
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(comparison, "_configuration", lambda *of: whole(*of).with_values({"simulator.max_steps": 30}))
+        yield
+
+
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
     out = tmp_path_factory.mktemp("table")

@@ -34,7 +34,7 @@ def mesh():
 
 
 @pytest.fixture(scope="module")
-def weights(mesh, tmp_path_factory):
+def weights(mesh, tmp_path_factory, small_banks):
     torch.manual_seed(0)
     folder = tmp_path_factory.mktemp("weights") / "own"
     card = ObjectCard(mesh.name, mesh.size_m, crop_side_m(mesh.size_m))

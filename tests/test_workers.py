@@ -99,6 +99,7 @@ def test_a_benchmark_on_a_cluster_has_the_same_results(cluster, tmp_path):
 
 
 def test_a_cluster_that_is_not_there_is_told(monkeypatch):
-    monkeypatch.setenv("RAY_CLIENT_CONNECT_TIMEOUT_S", "1")
+    monkeypatch.setattr("ray.util.client.worker.INITIAL_TIMEOUT_SEC", 1)
+    monkeypatch.setattr("ray.util.client.worker.MAX_TIMEOUT_SEC", 1)
     with pytest.raises(SaccadeError, match=r"no Ray cluster answers at ray://127\.0\.0\.1:1"):
         list(in_processes(square, WORK, 1, "ray://127.0.0.1:1"))
