@@ -123,6 +123,14 @@ def test_each_can_that_an_image_shows_is_an_instance_of_its_own():
     assert events == []
 
 
+def test_a_thing_that_is_told_twice_in_an_image_is_one():
+    """It stays alone of its kind, so that what happens to it is noticed."""
+    twice = np.array([CANS[0], CANS[0] + [0.01, 0.0, 0.0]])
+    told, events = believed([twice] * 4 + [CANS[2:]] * 4)
+    assert len(told.each()) == 1
+    assert events == [KIND]
+
+
 def test_where_nobody_has_looked_there_may_be_one_more():
     """Of several; its particles are where the images so far have not shown that nothing is there."""
     told, _ = believed([CANS[:2]] * 6)

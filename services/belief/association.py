@@ -27,7 +27,7 @@ VAGUE_M = 0.12  # chosen: no instance is born from a percept with a larger devia
 DEAD_LOG_ODDS = -2.0  # chosen: an instance dies if its log odds of being there are lower, unless it is the last one
 LOST_M = 0.2  # chosen: nor is one kept whose place is not known to this deviation, while others are
 MOST = 8  # chosen: instances of a kind
-SAME = 0.6  # chosen: two instances nearer to each other than so many of their radii are one
+SAME = 0.6  # chosen: two instances, or percepts of an image, nearer to each other than so many radii are one
 
 
 def assigned(places: Sequence[Moments], percepts: Sequence[Evidence]) -> list[int | None]:

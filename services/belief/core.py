@@ -85,13 +85,22 @@ class BeliefFilter:
                           if goal.presence > WORTH_COMPARING for likeness in self._likeness(goal, self.place)}
             self.instances = {name: [self._instance(name, 1, self._rng(0, f"start {name}"))] for name in self.names}
         above = self.config.belief.present_above
-        seen = {name: [p for p in percepts[name].each() if p.presence > above] for name in self.names}
+        seen = {name: self._apart([p for p in percepts[name].each() if p.presence > above]) for name in self.names}
         changes: list[tuple[Instance, Change]] = []
         for name in self.names:
             told = self._update(name, percepts[name], seen, changes)
             counts = count_probabilities([belief.presence for belief in told])
             yield Output(BELIEF, replace(told[0], further=told[1:], count_probabilities=counts), name)
         yield Output(EVENTS, _events(percepts[self.names[0]], changes))
+
+    def _apart(self, percepts: list[Percept]) -> list[Percept]:
+        """Percepts of one kind in one image, the likeliest first, without those of the same thing once more."""
+        kept: list[Percept] = []
+        for percept in percepts:
+            places = [evidence_of(other).mean for other in kept]
+            if not kept or is_apart(evidence_of(percept).mean, places, SAME * self.radius_m[percept.object]):
+                kept.append(percept)
+        return kept
 
     def _likeness(self, goal: Percept, place: Place | None) -> list[Likeness]:
         """How views of an object are compared with its percept in the goal image. Empty if they cannot be. In a place

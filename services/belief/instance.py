@@ -11,7 +11,7 @@ from saccade.services.belief.attitude import Views
 from saccade.services.belief.free_energy import crop_term, identity_term, likelihood_term, pose_term, position_term
 from saccade.services.belief.motion import Change, Motion
 from saccade.services.belief.pose import GoalView
-from saccade.services.belief.position import Evidence, Moments, PositionFilter, of_whole
+from saccade.services.belief.position import Evidence, Moments, PositionFilter, of_whole, wholly_hiding
 from saccade.shared.bus.messages import Belief, Percept
 from saccade.shared.config import BeliefConfig
 from saccade.shared.model.latent import LatentTransition
@@ -110,7 +110,7 @@ class Instance:
     def _notice(self, percept: Percept, seen: bool, others: Others, rng: np.random.Generator) -> Change | None:
         """What is noticed to have happened. The belief then begins anew where it has to."""
         motion, position, anchor = self.motion, self.position, self.motion.anchor
-        clear = position.clear(motion.places, percept.world_from_camera, percept.intrinsics_px, others)
+        clear = position.clear(motion.places, percept.world_from_camera, percept.intrinsics_px, wholly_hiding(others))
         evidence = of_whole(percept, self.kind.radius_m, others) if seen else None
         change = motion.step(percept.step, evidence, percept.presence, clear)
         if change is None:
@@ -121,7 +121,7 @@ class Instance:
             position.placed(change.place, change.covariance, rng)
             self.since = percept.step
         if change.kind == "moved" and anchor is not None and not position.clear(
-                anchor.place[None], percept.world_from_camera, percept.intrinsics_px, others)[0]:
+                anchor.place[None], percept.world_from_camera, percept.intrinsics_px, wholly_hiding(others))[0]:
             self.left = anchor.place, anchor.covariance[:3, :3]
         if change.kind == "moved" and self.goal_view is not None:
             self.goal_view.forget()

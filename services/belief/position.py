@@ -184,8 +184,8 @@ class PositionFilter:
     def not_found(self, camera: Array, intrinsics_px: Array, others: list[tuple[Evidence, float]]) -> None:
         """Updates the presence of an object that no image has shown so far. For the arguments see `visible`."""
         if self.unseen is not None:
-            whole = [(evidence, HIDES * radius_m) for evidence, radius_m in others]
-            self.unseen.missed(self.clear(self.unseen.points, camera, intrinsics_px, whole, margin_px=0.0))
+            hiding = wholly_hiding(others)
+            self.unseen.missed(self.clear(self.unseen.points, camera, intrinsics_px, hiding, margin_px=0.0))
             self.log_odds = self.prior + self.unseen.log_likelihood
 
     def carried(self, velocity_m: Array, seen: bool, rng: np.random.Generator) -> None:
@@ -250,6 +250,11 @@ def in_view(points: Array, camera: Array, intrinsics_px: Array, margin_px: float
     pixels, depth = project(points, camera, intrinsics_px)
     inside = (pixels > margin_px) & (pixels < IMAGE_SIZE_PX - margin_px)
     return inside.all(-1) & (depth > NEAREST_M)
+
+
+def wholly_hiding(others: list[tuple[Evidence, float]]) -> list[tuple[Evidence, float]]:
+    """The `others` with the radii (m) within which they hide an object wholly, and not just a part of it."""
+    return [(evidence, HIDES * radius_m) for evidence, radius_m in others]
 
 
 def behind(points: Array, eye: Array, seen: list[tuple[Evidence, float]]) -> NDArray[np.bool_]:
