@@ -61,6 +61,13 @@ def test_the_images_count_from_the_first_that_shows_the_change():
     assert noticed(hidden[:14], [report(13, "mug")]) == Noticed(1, 1, 0)
 
 
+def test_that_it_has_left_may_be_reported_long_before_where_it_is():
+    """Its empty place is seen at once, and the object much later; what is reported long after this is false."""
+    hidden = [truth(step, HERE if step < 3 else THERE, in_view=float(step < 3 or step >= 15)) for step in range(30)]
+    assert noticed(hidden, [report(5, "mug"), report(16, "mug")]) == Noticed(1, 1, 0)
+    assert noticed(hidden, [report(5, "mug"), report(16, "mug"), report(25, "mug")]) == Noticed(1, 1, 1)
+
+
 def test_what_was_taken_is_noticed_where_its_place_is_in_view():
     taken = [truth(step, HERE if step < 3 else None) for step in range(15)]
     assert noticed(taken, []) == Noticed(1, 0, 0)

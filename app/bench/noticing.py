@@ -18,7 +18,7 @@ from saccade.shared.world.sight import IN_VIEW, seen_shares
 from saccade.shared.world.workspace import NO_BOXES, Boxes
 
 WITHIN = 5  # a change is noticed if it is reported at most so many images after the first that shows it
-AGAIN = 5  # steps after a report in which further reports are of the same change
+AGAIN = 5  # steps after a report, and after the first image of the change, in which further reports are of the same
 
 
 class Noticed(NamedTuple):
@@ -106,6 +106,8 @@ def _look(each: _Watched, truth: Truth, label: str, boxes: dict[str, Boxes]) -> 
         each.images += 1
     elif seen is not None and seen.changes != each.now.changes and not _same(seen.box, each.now.box):
         each.images = 0
+        if each.reported is not None:  # that it has left was reported; now it can be reported where it is
+            each.reported = truth.step
 
 
 def _in_view(each: _Watched, truth: Truth, label: str, boxes: dict[str, Boxes]) -> bool:
@@ -131,7 +133,8 @@ def _answer(each: _Watched, said: bool, step: int, tally: _Tally) -> bool:
         each.images = None
     if said and each.reported is None and each.open:
         each.reported = step
-    if each.reported is not None and step >= each.reported + AGAIN and not each.now.moving:
+    is_shown = each.seen is not None and each.seen.changes == each.now.changes
+    if each.reported is not None and is_shown and step >= each.reported + AGAIN and not each.now.moving:
         each.open, each.reported = False, None
     return is_right
 
