@@ -22,7 +22,7 @@ from saccade.training.paper_data import CleanViews, PaperFrames
 from saccade.training.pictures import draw_paper_extraction
 from saccade.training.precision import reduced_precision
 from saccade.training.settings import TrainingConfig
-from saccade.training.tasks import EVALUATED_EACH, CcnTask, generator_of, on_device, split
+from saccade.training.tasks import CcnTask, evaluated, generator_of, on_device, split
 
 KL_TRANSITION = 10.0  # lambda_4 in the paper's table of the optimisation
 MASKING, CROPPING, IDENTIFICATION = 10.0, 10.0, 10.0  # weights of errors summed over 64 x 64 x 3, as in phase 1
@@ -113,7 +113,7 @@ class PaperExtractionTask:
     def evaluate(self) -> dict[str, float]:
         """Errors of the networks on images of held-out directions that are always the same, see `errors`."""
         generator = self.generator(2 ** 31)
-        count = min(EVALUATED, EVALUATED_EACH * len(self.held_out))
+        count = evaluated(EVALUATED, len(self.held_out))
         batch = self.frames.compose(self._pick(self.held_out, count, generator), generator)
         _, center, scale, _, logit = self.module(batch.image)
         return errors(logit[:, None], (center[:, None] + 1) / 2, scale.log()[:, None], batch)

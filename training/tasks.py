@@ -27,6 +27,11 @@ EVALUATED_EACH = 4  # an evaluation uses no held-out direction more often, on av
 Network = TypeVar("Network", bound=nn.Module)
 
 
+def evaluated(most: int, held_out: int) -> int:
+    """How many images an evaluation has: at most so many, and fewer where few directions are held out."""
+    return min(most, EVALUATED_EACH * held_out)
+
+
 def generator_of(config: TrainingConfig, part: str, device: torch.device, *key: int) -> torch.Generator:
     """A random generator that depends only on the seed, the part and the key (for example the step)."""
     entropy = [config.seed, zlib.crc32(part.encode()), *key]
@@ -98,7 +103,7 @@ class CcnTask:
     def evaluate(self) -> dict[str, float]:
         """Errors of the goal direction on held-out directions: the median (radians), and shares below two limits."""
         errors = goal_search_errors(self.ccn, self.composer, self.held_out, self.generator(2 ** 31), jitter=0.4,
-                                    pairs=min(150, EVALUATED_EACH * len(self.held_out)))
+                                    pairs=evaluated(150, len(self.held_out)))
         return {"goal_median_rad": float(np.median(errors)), "goal_within_0.19": float((errors < 0.19).mean()),
                 "goal_within_0.5": float((errors < 0.5).mean())}
 
@@ -116,7 +121,7 @@ class ExtractionTask:
         self.module = on_device(Extraction(len(views)), device)
         self.config, self.device = config, device
         self.lambdas: list[float] = []
-        self._evaluated = min(200, EVALUATED_EACH * sum(len(v.azimuth_rad) for v in views) // 10)
+        self._evaluated = evaluated(200, sum(len(split(v, config.seed, device)[1]) for v in views))
 
     def loss(self, step: int) -> tuple[Tensor, dict[str, float]]:
         """The loss at a step, and its parts."""

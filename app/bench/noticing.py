@@ -18,7 +18,7 @@ from saccade.shared.world.sight import IN_VIEW, seen_shares
 from saccade.shared.world.workspace import NO_BOXES, Boxes
 
 WITHIN = 5  # a change is noticed if it is reported at most so many images after the first that shows it
-AGAIN = 5  # steps after a report, and after the first image of the change, in which further reports are of the same
+AGAIN = 5  # steps after a report, and after the first image of a change, in which reports are of the same change
 
 
 class Noticed(NamedTuple):

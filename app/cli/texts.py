@@ -17,17 +17,16 @@ def configured(path: Path | None, given: dict[str, Any], values: list[str] | Non
 
     Raises SaccadeError if the agent is unknown, or if a file, a key or a value is wrong.
     """
-    from saccade.app.run.registry import configuration, reason_for_open
+    from saccade.app.run.registry import OPEN, configuration, reason_for_open
 
     options = {key: value for key, value in given.items() if value is not None}
-    config, name = configuration(path, options | dict(map(parse_value, values or ())), agent,
-                                 lying=lying)
+    config, name = configuration(path, options | dict(map(parse_value, values or ())), agent, lying=lying)
     if is_list(config.scene.objects):
         from saccade.app.objects.lists import assembled
 
         objects = assembled(config.scene.objects, config.perception.architecture)
         config = config.with_values({"scene.objects": objects})
-    if agent is None and (why := reason_for_open(config, lying)):
+    if agent is None and name == OPEN and (why := reason_for_open(config, lying)):
         from saccade.shared.render.objects import names_of
 
         names_of(config.scene.objects)  # a name that is misspelt is told first

@@ -28,7 +28,7 @@ from saccade.services.belief.attitude import PoseLikeness
 from saccade.services.belief.instance import Instance, Kind, Others
 from saccade.services.belief.motion import Change
 from saccade.services.belief.pose import GoalView, LatentLikeness, Likeness, TurnLikeness
-from saccade.services.belief.position import Evidence, Moments, PositionFilter, evidence_of, of_whole
+from saccade.services.belief.position import Array, Evidence, Moments, PositionFilter, evidence_of, of_whole
 from saccade.shared.bus.messages import Belief, Events, Percept
 from saccade.shared.bus.topics import BELIEF, EVENTS, GOAL, GOAL_PERCEPT, PERCEPT, Output
 from saccade.shared.config import Config
@@ -95,12 +95,12 @@ class BeliefFilter:
 
     def _apart(self, percepts: list[Percept]) -> list[Percept]:
         """Percepts of one kind in one image, the likeliest first, without those of the same thing once more."""
-        kept: list[Percept] = []
+        kept: list[tuple[Percept, Array]] = []
         for percept in percepts:
-            places = [evidence_of(other).mean for other in kept]
-            if not kept or is_apart(evidence_of(percept).mean, places, SAME * self.radius_m[percept.object]):
-                kept.append(percept)
-        return kept
+            place = evidence_of(percept).mean
+            if is_apart(place, [other for _, other in kept], SAME * self.radius_m[percept.object]):
+                kept.append((percept, place))
+        return [percept for percept, _ in kept]
 
     def _likeness(self, goal: Percept, place: Place | None) -> list[Likeness]:
         """How views of an object are compared with its percept in the goal image. Empty if they cannot be. In a place
