@@ -42,12 +42,12 @@ def is_free(port: int) -> bool:
 
 @pytest.fixture(scope="module")
 def cluster():
-    """A Ray of one node."""
+    """A Ray of one node. Its server forks while threads of gRPC run, in which the handlers of gRPC may crash."""
     port = next(port for port in range(20_100, 21_000) if is_free(port))  # beyond those of Ray's workers
     ray = str(Path(sys.executable).with_name("ray"))
     started = subprocess.run([ray, "start", "--head", "--port", "0", "--ray-client-server-port", str(port),
                               "--num-cpus", "2", "--include-dashboard", "false", "--disable-usage-stats"],
-                             capture_output=True, text=True)
+                             env=os.environ | {"GRPC_ENABLE_FORK_SUPPORT": "0"}, capture_output=True, text=True)
     assert started.returncode == 0, started.stderr
     yield f"ray://127.0.0.1:{port}"
     subprocess.run([ray, "stop", "--force"], capture_output=True)

@@ -72,6 +72,17 @@ def _follow_the_parent() -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
+def _again(join: Callable[[], Any], attempts: int = 3) -> None:
+    """Joins a cluster which is there, but was too slow, or whose process for us died at its start."""
+    for _ in range(attempts - 1):
+        try:
+            join()
+            return
+        except ConnectionAbortedError:
+            continue
+    join()
+
+
 def _on_ray(function: Callable[..., Any], work: Work, cluster: str) -> Results:
     try:
         import ray
@@ -82,10 +93,7 @@ def _on_ray(function: Callable[..., Any], work: Work, cluster: str) -> Results:
     join = functools.partial(ray.init, cluster, log_to_driver=False, logging_level=logging.ERROR,
                              runtime_env={"env_vars": environment})
     try:
-        try:
-            join()
-        except ConnectionAbortedError:  # the cluster is there, but was too slow
-            join()
+        _again(join)
     except (ConnectionError, ValueError, RuntimeError) as error:
         raise SaccadeError(f"no Ray cluster answers at {cluster}: {str(error).strip().splitlines()[-1]}") from error
     try:
