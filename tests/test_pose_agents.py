@@ -128,6 +128,15 @@ def test_training_continues_as_if_it_had_not_been_interrupted_and_its_weights_se
     assert set(trained.calibration) == {f"{name}.{what}" for name in NAMES for what in ("pixel_std", "log_scale_std")}
 
 
+def test_training_goes_on_from_the_network_of_other_weights_of_the_same_objects(weights, tmp_path):
+    start(tmp_path / "more", TINY.model_copy(update={"begin_with": str(weights)}))
+    trainer, before = Trainer(tmp_path / "more", "posecnn"), Weights(weights).state("posecnn")
+    assert all(np.array_equal(value.numpy(), before[key]) for key, value in trainer.task.module.state_dict().items())
+    start(tmp_path / "others", TINY.model_copy(update={"begin_with": str(weights), "names": NAMES[::-1]}))
+    with pytest.raises(SaccadeError, match=r"are of soup_can, rice_box, not of rice_box, soup_can in this order"):
+        Trainer(tmp_path / "others", "posecnn")
+
+
 @pytest.mark.parametrize("agent", ["posecnn", "posecnn-infogain"])
 def test_an_agent_runs_on_the_bus_and_in_one_process_alike_and_is_replayed(agent, tmp_path, weights):
     logs = {}

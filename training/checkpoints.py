@@ -13,7 +13,7 @@ from torch import Tensor, from_numpy
 
 from saccade.shared.errors import SaccadeError
 from saccade.shared.model.weights import Weights
-from saccade.training.settings import TrainingConfig
+from saccade.training.settings import WHOLE, TrainingConfig
 
 CHECKPOINT = "checkpoint.safetensors"
 
@@ -70,13 +70,19 @@ def ccn_of(run_dir: Path, config: TrainingConfig, name: str) -> tuple[dict, dict
 
 
 def extraction_before(config: TrainingConfig, part: str) -> dict[str, Tensor] | None:
-    """The tensors of the networks that phase 2 of an object goes on from (`config.begin_with`), or None.
+    """The tensors of the networks that phase 2, of an object or of all, goes on from (`config.begin_with`), or None.
 
-    Raises SaccadeError if there are no such networks, or if the weights have another architecture.
+    Raises SaccadeError if there are no such networks, or if the weights have another architecture or other objects.
     """
     if config.begin_with is None:
         return None
-    return _in_weights(config, config.begin_with, config.object_of(part), part, "begin_with")[1]
+    if part not in WHOLE:
+        return _in_weights(config, config.begin_with, config.object_of(part), part, "begin_with")[1]
+    held = Weights(Path(config.begin_with)).names
+    if held != config.names:
+        raise SaccadeError(f"weights {config.begin_with} are of {', '.join(held)}, not of {', '.join(config.names)} in "
+                           "this order: name others (begin_with)")
+    return _in_weights(config, config.begin_with, config.names[0], part, "begin_with")[1]
 
 
 def _in_weights(config: TrainingConfig, folder: str, name: str, part: str, setting: str) -> \

@@ -83,7 +83,7 @@ def task_of(run_dir: Path, config: TrainingConfig, part: str, device: torch.devi
     if config.architecture == "posecnn":
         from saccade.training.posecnn import PoseCnnTask  # here, because it loads the simulator
 
-        return PoseCnnTask(config, device)
+        return PoseCnnTask(config, device, extraction_before(config, part))
     if config.architecture == "lexa":
         from saccade.training.lexa.task import LexaTask
 

@@ -32,7 +32,7 @@ from saccade.training.tasks import on_device
 
 POINTS = 100  # points of each mesh in the loss of the rotation
 SEEN_CELLS = 8  # an object that is seen in fewer cells of the map of labels teaches no rotation
-VOTING, ROTATION = 2.0, 4.0  # weights of the losses beside that of the labels
+VOTING, ROTATION = 2.0, 12.0  # weights of the losses beside that of the labels
 JITTER = 0.08  # of the regions in training, in shares of their side: as wrong as the votes' centres
 FOCAL_WIDTHS = INTRINSICS_PX[0] / IMAGE_SIZE_PX  # the focal length in image widths
 EVALUATED = 100  # number of images in an evaluation
@@ -40,14 +40,20 @@ AHEAD = 6  # processes that render for a GPU
 
 
 class PoseCnnTask:
-    """Trains one network for all objects. All of a step's images are rendered for it."""
+    """Trains one network for all objects. All of a step's images are rendered for it.
 
-    def __init__(self, config: TrainingConfig, device: torch.device):
+    `before` are the tensors of a network from which it goes on.
+    """
+
+    def __init__(self, config: TrainingConfig, device: torch.device, before: dict[str, Tensor] | None = None):
         torch.manual_seed(config.seed)
         meshes = [load_mesh(config.objects, name) for name in config.names]
         self.batches = Batches(config)
         self.ahead: Iterator[RenderedBatch] | None = None
-        self.module = on_device(PoseNetwork(len(meshes)), device)
+        network = PoseNetwork(len(meshes))
+        if before is not None:
+            network.load_state_dict(before)
+        self.module = on_device(network, device)
         self.config, self.device = config, device
         self.lambdas: list[float] = []
         rng = np.random.default_rng(config.seed)

@@ -45,7 +45,7 @@ class TrainingConfig(Section):
     phase 2, once they count. `guide_extraction` is the weight, at the start, of the errors of centre and scale
     themselves. The paper uses only the error of the crop; with the guide fewer steps are needed to find the object.
     `ccns` is a folder of weights whose CCNs of these objects are used unchanged, so that only phase 2 is trained.
-    `begin_with` is a folder of weights, and phase 2 goes on from its networks.
+    `begin_with` is a folder of weights, and phase 2 goes on from its networks (PoseCNN too).
 
     With "posecnn" there is one network. `symmetric` are the objects whose rotation has the loss for symmetric objects.
 
