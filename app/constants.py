@@ -12,7 +12,7 @@ from saccade.shared.config import PACKAGE, BeliefConfig, PlannerConfig, Section
 
 MODULES = ("services.belief.core", "services.belief.instance", "services.belief.association",
            "services.belief.motion", "services.belief.pose", "services.belief.position", "services.belief.attitude",
-           "services.planner.core", "services.planner.candidates", "services.planner.place",
+           "services.planner.core", "services.planner.arrival", "services.planner.candidates", "services.planner.place",
            "services.planner.free_energy", "services.planner.moving", "services.planner.instances")
 SECTIONS: dict[str, type[Section]] = {"belief": BeliefConfig, "planner": PlannerConfig}
 KINDS = ("chosen", "derived", "measured", "from the")  # a constant's comment begins with one of these

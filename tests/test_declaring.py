@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from saccade.services.belief.pose import LatentLikeness
-from saccade.services.planner.core import SAID, build
+from saccade.services.planner.arrival import SAID
+from saccade.services.planner.core import build
 from saccade.services.planner.declaring import BESIDE, BESIDE_RAD, Evidence, Rivals, fused_here, together
 from saccade.shared.bus.messages import Belief, Percept, Plan
 from saccade.shared.config import Config

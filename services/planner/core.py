@@ -12,8 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from saccade.services.planner.arrival import Arrival
 from saccade.services.planner.candidates import draw
-from saccade.services.planner.declaring import UNLIKELY, Evidence, around, fused_here
 from saccade.services.planner.free_energy import Terms, expected_free_energy
 from saccade.services.planner.goal import Preference, infer_preference
 from saccade.services.planner.goal_views import Side, goal_eye, goal_viewpoint, heading
@@ -28,9 +28,8 @@ from saccade.shared.loop.seeding import generator
 from saccade.shared.loop.service import Inputs, Service
 from saccade.shared.model.object_card import symmetries
 from saccade.shared.model.weights import Weights
-from saccade.shared.world.geometry import Array, look_at, rotation_angle, rotation_towards, unit
+from saccade.shared.world.geometry import Array, look_at, rotation_angle, rotation_towards
 from saccade.shared.world.place import place_of
-from saccade.shared.world.symmetry import NONE
 from saccade.shared.world.task import Spheres, spheres_around, success
 from saccade.shared.world.workspace import Boxes
 
@@ -41,16 +40,12 @@ FOUND_M = 0.06  # chosen: the target counts as found if the deviation of its pos
 KNOWN_M = 0.10  # chosen: an object becomes an obstacle if the deviation of its position is below this
 ARRIVED_M = 0.01  # chosen: the camera has arrived if it is within this distance of its viewpoint and within ARRIVED_RAD
 ARRIVED_RAD = 0.05  # chosen: the camera has arrived if it is within this angle of its viewpoint and within ARRIVED_M
-THERE_M = 0.04  # chosen: a view that was compared is the goal's if the goal's is believed to be within this of it
 STUCK_M = 0.002  # chosen: a camera that moves less than this in a step counts as arrived, because it cannot come nearer
 TURN_M = 0.10  # chosen: nearer than this to its viewpoint the camera turns as planned; before, it looks at the target
-SAID = 3  # chosen: steps for which the agent says that it is there before it takes the episode's going on for a no
-PATIENT = 6  # chosen: arrivals at views that agree in part after which one of them counts as wrong
 VISITED_M = 0.05  # chosen: viewpoints within about this distance of one that was not the goal's also become costly
 VISITED_RAD = 0.35  # chosen: viewpoints within about this angle of one that was not the goal's also become costly
 VISITED_COST = 6.0  # chosen: nats that are added to the cost of a viewpoint that was not the goal's
 DOUBT_LIMIT = 2.5  # chosen: after wrong viewpoints the goal's log posterior is divided by at most this
-SURE_ALONE = 0.6  # chosen: without second thoughts the agent says so above this probability by the present view
 PUBLISHED = 64  # number of candidates in a plan message; it changes nothing that the agent does
 
 
@@ -78,7 +73,8 @@ class Planner:
         self.target_instance = 1  # the one of the target's kind that the agent goes for
         self.tried = {1: Tried()}  # by the number of the instance
         self.velocity_m: Array | None = None  # of the target, as believed [3]
-        self.compared = False  # whether a view of the target was compared with the goal image
+        self.arrival = Arrival(self.symmetry, retry=self.config.planner.retry, moved_by=self.moved_by,
+                               ends_at_goal=self.ends_at_goal)
         return ()
 
     @property
@@ -104,7 +100,8 @@ class Planner:
         spheres = self.obstacles(beliefs)
         ground = self._ground(beliefs)
         beliefs = self._refine(beliefs, ground)
-        self._note_rivals(beliefs)
+        if self.preference is not None:
+            self.arrival.see(beliefs[self.preference.target], self.now)
         chosen, mode, eye = self.plan, self._mode(beliefs), self._believed_eye(beliefs, camera, ground)
         moved = self._moved if self.hand is None else self._followed
         due, declared = moved(chosen, mode, beliefs, camera, None if eye is None else ground.nearest(eye))
@@ -178,46 +175,10 @@ class Planner:
         """Whether the plan is to be renewed, and whether the agent says that it has arrived."""
         arrived, declared = chosen is not None and self._arrived(camera, chosen.viewpoint), False
         if chosen is not None and arrived and chosen.mode == "goal":
-            target = beliefs[chosen.target]
-            if not self.config.planner.retry:
-                declared = target.goal_here > SURE_ALONE
-            elif self.now.beside:
-                self.now.wanted = self.now.beside.pop(0)
-            else:
-                evidence = self._evidence(target, camera)
-                self.now.is_near = evidence.is_enough
-                if evidence.is_enough:
-                    self.now.wanted = None
-                declared = evidence.is_enough and self._is_at(eye, camera, evidence)
-                if declared and self._was_wrong():
-                    declared = self.now.is_near = False
-                    self._look_elsewhere(target, camera, evidence.look)
-                elif not self.now.is_near:
-                    self._has_looked(target, camera, evidence.look, wrong=not self._may_be_beside(evidence) and (
-                        not evidence.rival or evidence.probability < UNLIKELY))
+            declared = self.arrival.judge(beliefs[chosen.target], camera, self.now, eye)
         self.age += 1
         due = chosen is None or arrived or mode != chosen.mode or self.age >= self._patience
         return due, declared
-
-    def _may_be_beside(self, evidence: Evidence) -> bool:
-        """Whether the goal's view may be beside one that agrees in part. Where the agent comes no nearer, it is not."""
-        self.now.in_part = (self.now.in_part + 1) % PATIENT if evidence.is_beside else 0
-        return self.now.in_part > 0
-
-    def _was_wrong(self) -> bool:
-        """Whether the agent has said often enough that it is there: where the world ends an episode at the goal, one
-        that goes on is not there."""
-        self.now.said += 1
-        return self.ends_at_goal and self.now.said % SAID == 0
-
-    def _look_elsewhere(self, target: Belief, camera: Array, look: float) -> None:
-        """Looks from all around a view that was like the goal's and was not it, once, and then from elsewhere. Where it
-        agrees best is believed to be the goal's view."""
-        if self.now.beside is None and look > UNLIKELY:
-            self.now.beside = [*around(unit(camera[:3, 3] - target.mean_m)), None]
-            self.now.wanted = self.now.beside.pop(0)
-        else:
-            self._has_looked(target, camera, look, wrong=True)
 
     @property
     def _patience(self) -> int:
@@ -226,48 +187,11 @@ class Planner:
 
     def _followed(self, chosen: Plan | None, mode: str, beliefs: dict[str, Belief], camera: Array,
                   eye: Array | None) -> tuple[bool, bool]:
-        """The same for a hand, which `Hand` judges."""
-        if self.hand is None or chosen is None:
-            return True, False
-        if mode != chosen.mode and not self.hand.there:
+        """The same for a hand."""
+        if self.hand is None or chosen is None or (mode != chosen.mode and not self.hand.there):
             return True, False
         target = beliefs[chosen.target] if chosen.mode == "goal" else None
-        evidence = None if target is None else self._evidence(target, camera)
-        eye = eye if self.now.wanted is None else None  # whoever looks from elsewhere is not led back before
-        verdict = self.hand.take(camera, evidence, eye)
-        if verdict in ("wrong", "rival") and target is not None:
-            self._has_looked(target, camera, self.hand.look, wrong=verdict == "wrong")
-        return verdict in ("renew", "wrong", "rival"), verdict == "there"
-
-    def _note_rivals(self, beliefs: dict[str, Belief]) -> None:
-        """Keeps in mind which directions are likely now, and whether views are compared. Views that look the same are
-        no rivals."""
-        if self.preference is None:
-            return
-        target = beliefs[self.preference.target]
-        self.compared |= target.goal_agreement is not None
-        if self.config.planner.retry and self.symmetry[target.object] == NONE:
-            self.now.rivals.take(target)
-
-    def _evidence(self, target: Belief, camera: Array) -> Evidence:
-        fused = fused_here(target, camera, self.symmetry[target.object])
-        return Evidence(target.goal_here, fused,
-                        self.now.rivals.beside(camera, target.mean_m) is not None,
-                        self.now.rivals.elsewhere(camera, target.mean_m), target.goal_agreement, self.compared)
-
-    def _is_at(self, eye: Array | None, camera: Array, evidence: Evidence) -> bool:
-        """Whether the camera is where the goal's view is believed to be, `eye` [3], now that it was compared. Where
-        nobody follows the plan, the task's tolerance was enough to arrive."""
-        if eye is None or evidence.agreement is None or self.moved_by == "recording":
-            return True
-        return bool(np.linalg.norm(eye - camera[:3, 3]) < THERE_M)
-
-    def _has_looked(self, target: Belief, camera: Array, look: float, *, wrong: bool) -> None:
-        """The agent has arrived and looked, and goes on: to a rival, if the view may be the goal's all the same."""
-        self.now.rivals.looked(camera, target.mean_m, look)
-        self.now.wanted = None if wrong else self.now.rivals.beside(camera, target.mean_m)
-        if wrong and self.config.planner.retry:
-            self.now.visited.append(camera)
+        return self.arrival.judge_hand(self.hand, target, camera, self.now, eye)
 
     def _arrived(self, camera: Array, viewpoint: Array) -> bool:
         """Whether the camera is at the viewpoint, or as near as it can come."""
