@@ -101,7 +101,7 @@ def test_without_opencv_it_says_so(monkeypatch, capsys, tmp_path):
     code, _, err = call(monkeypatch, capsys, "board", "--out", tmp_path / "b.pdf")
     assert (code, err.count("\n")) == (2, 1)
     assert "boards need OpenCV" in err
-    assert "pip install opencv-python-headless" in err
+    assert "pip install 'saccade[camera]'" in err
 
 
 # The pose of one image.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import ExifTags, Image
 
 from saccade.app.run.run import resolve
 from saccade.services.camera.core import SERVICE, Camera, build
@@ -129,6 +129,23 @@ def test_frames_are_resampled_by_the_intrinsics_given(tmp_path):
     frame, = frames_of(camera_of(str(tmp_path / "f"), poses=poses, intrinsics_px=[400, 400, 320, 240]))
     expected, _ = project(np.zeros(3), frame.world_from_camera, frame.intrinsics_px)
     np.testing.assert_allclose(centroid(frame.rgb, expected), expected, atol=0.1)
+
+
+def test_the_first_picture_of_a_folder_tells_its_focal_length(tmp_path):
+    """Unless the user does."""
+    (tmp_path / "f").mkdir()
+    drawn, _ = project(np.zeros(3), HERE, (554.7, 554.7, 320.0, 240.0))
+    exif = Image.Exif()
+    exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = 30
+    Image.fromarray(dots([drawn], (640, 480))).save(tmp_path / "f" / "a.jpg", exif=exif, quality=95)
+    poses = written(tmp_path / "p.jsonl", line())
+    camera = camera_of(str(tmp_path / "f"), poses=poses)
+    assert any("a.jpg: the focal length is from its EXIF data (30 mm in 35 mm film)" in note for note in camera.notes)
+    frame, = frames_of(camera)
+    expected, _ = project(np.zeros(3), frame.world_from_camera, frame.intrinsics_px)
+    np.testing.assert_allclose(centroid(frame.rgb, expected), expected, atol=0.3)
+    given = camera_of(str(tmp_path / "f"), poses=poses, intrinsics_px=[400, 400, 320, 240])
+    assert not any("EXIF" in note for note in given.notes)
 
 
 def test_a_goal_image_of_the_cameras_own_is_resampled_like_its_images(tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import builtins
 import threading
 
+import av
 import numpy as np
 import pytest
 from PIL import Image
@@ -196,14 +197,38 @@ def test_an_image_that_breaks_off_is_named_when_it_is_reached(tmp_path):
     assert f"image {tmp_path / 'b.png'} cannot be read" in complaint(next, images)
 
 
-def test_without_opencv_a_video_says_what_to_install(tmp_path, monkeypatch):
+def test_without_pyav_a_video_says_what_to_install(tmp_path, monkeypatch):
     (tmp_path / "a.mp4").write_bytes(b"x")
     real = builtins.__import__
 
-    def without_cv2(name, *more, **others):
-        if name == "cv2":
-            raise ImportError("No module named 'cv2'")
+    def without_av(name, *more, **others):
+        if name == "av":
+            raise ImportError("No module named 'av'")
         return real(name, *more, **others)
 
-    monkeypatch.setattr(builtins, "__import__", without_cv2)
-    assert "pip install opencv-python-headless" in complaint(open_source, str(tmp_path / "a.mp4"))
+    monkeypatch.setattr(builtins, "__import__", without_av)
+    assert "pip install 'saccade[camera]'" in complaint(open_source, str(tmp_path / "a.mp4"))
+
+
+def filmed(path, codec="libx264", first_s=0, **options):
+    """A film of ten frames a second that become redder, written with PyAV."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=10, options=options)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        for k in range(10):
+            frame = av.VideoFrame.from_ndarray(np.full((48, 64, 3), (20 * k, 30, 30), np.uint8), format="rgb24")
+            frame.pts = k + round(10 * first_s)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+
+
+@pytest.mark.parametrize("film", [
+    {"path": "a.mp4", "x264-params": "tff=1:interlaced=1"}, {"path": "a.mkv", "first_s": 5},
+    {"path": "a.webm", "codec": "libvpx"}])
+def test_a_film_is_read_whole_interlaced_or_begun_late(tmp_path, film):
+    """Some containers tell a length from zero on, and no number of frames."""
+    path = tmp_path / film.pop("path")
+    filmed(path, **film)
+    images = list(open_source(str(path)))
+    np.testing.assert_allclose([i.time_s for i in images], np.arange(10) / 10, atol=1e-3)
+    np.testing.assert_allclose([i.rgb[..., 0].mean() for i in images], 20 * np.arange(10), atol=12)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from saccade.services.camera import sources
+from saccade.services.camera import sources, video
 from saccade.services.camera.poses import MAX_POSES, read_poses
 from saccade.services.camera.sources import Folder, open_source
 from saccade.shared.errors import SaccadeError
@@ -168,8 +168,8 @@ def test_a_video_of_too_many_pixels_is_refused_by_its_header(tmp_path, monkeypat
     writer.write(np.zeros((48, 64, 3), np.uint8))
     writer.release()
     assert open_source(str(path)).size_px == (64, 48)
-    monkeypatch.setattr(sources, "MAX_PIXELS", 64 * 48 - 1)
-    monkeypatch.setattr(sources, "_size", None)  # nothing is made of a frame
+    monkeypatch.setattr(video, "MAX_PIXELS", 64 * 48 - 1)
+    monkeypatch.setattr(video, "_rgb", None)  # nothing is made of a frame
     assert "has 64x48 pixels, more than" in complaint(open_source, str(path))
 
 

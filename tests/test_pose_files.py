@@ -94,6 +94,20 @@ def test_the_header_tells_the_order_of_the_quaternion(tmp_path):
     assert np.abs(read_trajectory(path).world_from_camera - TRUE).max() > 0.1
 
 
+def test_the_header_tells_the_order_of_all_columns(tmp_path):
+    """Of the position, and of the quaternion before it."""
+    numbers = np.array(made.rows(TRUE @ FLIP, "xyzw"))
+    lines = [made.words([t, *row], ",") for t, row in zip(TIMES_S, numbers[:, [3, 4, 5, 6, 2, 1, 0]], strict=True)]
+    path = written(tmp_path / "a.csv", "timestamp,qx,qy,qz,qw,tz,ty,tx", *lines)
+    np.testing.assert_allclose(read_trajectory(path).world_from_camera, TRUE, atol=1e-6)
+
+
+@pytest.mark.parametrize("unit", [1e3, 1e6, 1e9])
+def test_times_since_1970_may_have_smaller_units(tmp_path, unit):
+    read = read_trajectory(made.tum(tmp_path / "a.txt", times=(TIMES_S + 1_305_031_102.0) * unit))
+    np.testing.assert_allclose(read.times_s, TIMES_S - 3.0, atol=1e-3)
+
+
 def test_nanoseconds_tell_euroc_without_a_header(tmp_path):
     """Its quaternions begin with w, those of TUM end with it."""
     path = made.euroc(tmp_path / "a.csv")
@@ -134,6 +148,17 @@ def test_each_frame_of_transforms_may_have_its_own_lens(tmp_path):
     tree["frames"][0]["fl_x"] = 900.0
     path.write_text(json.dumps(tree))
     assert "focal lengths go from 601 to 900 px" in complaint(one_lens, read_trajectory(path).lenses)
+
+
+def test_intrinsics_that_some_frames_have_are_taken_for_all_and_said(tmp_path):
+    path = made.transforms(tmp_path / "transforms.json")
+    tree = json.loads(path.read_text())
+    common = {name: tree.pop(name) for name in list(tree) if name != "frames"}
+    tree["frames"][2] |= common
+    path.write_text(json.dumps(tree))
+    read = read_trajectory(path)
+    assert len(read.lenses) == 1
+    assert any("1 of 6 frames have intrinsics: they are taken for all" in note for note in read.notes)
 
 
 def test_a_field_of_view_gives_the_focal_length_of_any_image(tmp_path):

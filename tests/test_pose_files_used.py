@@ -166,7 +166,7 @@ def test_a_key_turns_the_cameras_over_and_the_command_shows_it(monkeypatch, caps
     path = GOOD["tum"](tmp_path)
     _, out, _ = call(monkeypatch, capsys, "poses", "show", path, "--set", "camera.pose_convention=opengl")
     assert "0 of 6 are upright, 0 of 6 look downwards" in out
-    _, out, _ = call(monkeypatch, capsys, "poses", "show", path, "--set", "camera.poses_scale=2")
+    _, out, _ = call(monkeypatch, capsys, "poses", "show", path, "--scale", "2")
     assert "x 0.700 to 1.000" in out
 
 

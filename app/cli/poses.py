@@ -22,6 +22,8 @@ def poses() -> None:
 def show(file: Annotated[Path, typer.Argument(metavar="FILE", help="File or folder with the poses of a camera.")], *,
          out: Annotated[Path | None, typer.Option(
              help="Draw the cameras and the table, from above and from the side.", metavar="PICTURE.png")] = None,
+         scale: Annotated[float | None, typer.Option(
+             help="Length in metres of the unit of the poses.", show_default="1")] = None,
          values: Values = None) -> None:
     """Say how a file of poses is understood: its format, number, times, extent and conventions."""
     from saccade.app.cli.texts import parse_value
@@ -30,7 +32,8 @@ def show(file: Annotated[Path, typer.Argument(metavar="FILE", help="File or fold
     from saccade.services.camera.trajectories.reading import read_trajectory
     from saccade.shared.config import Config
 
-    config = Config().with_values(dict(map(parse_value, values or ())))
+    given = {} if scale is None else {"camera.poses_scale": scale}
+    config = Config().with_values(given | dict(map(parse_value, values or ())))
     read = read_trajectory(file, asked_of(config.camera))
     for line in report(read):
         print(printable(line, LINE_LIMIT))

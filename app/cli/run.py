@@ -55,6 +55,8 @@ def run(*, objects: Objects = None, names: Names = None, scenes: ScenesFile = No
                  "ROS 2 (ros:/camera/image_raw).")] = None,
         poses: Annotated[Path | None, typer.Option(
             help="File or folder with the camera's poses, such as TUM, transforms.json or COLMAP.")] = None,
+        scale: Annotated[float | None, typer.Option(
+            help="Length in metres of the unit of the poses.", show_default="1")] = None,
         intrinsics: Annotated[str | None, typer.Option(
             help="Intrinsics of the camera's images, in pixels.", metavar="fx,fy,cx,cy")] = None,
         board: Annotated[list[Path] | None, typer.Option(
@@ -97,6 +99,7 @@ def run(*, objects: Objects = None, names: Names = None, scenes: ScenesFile = No
              "scene.goal_intrinsics_px": numbers(goal_intrinsics, "--goal-intrinsics"),
              "scene.explore": explore or None, "bus.kind": bus,
              "perception.weights": weights, "camera.source": source, "camera.poses": poses,
+             "camera.poses_scale": scale,
              "camera.board": board[0] if board else None,
              "camera.more_boards": [str(path) for path in board[1:]] if board and len(board) > 1 else None,
              "camera.calibration": calibration,

@@ -7,6 +7,7 @@ known already; until then it tells nothing. The poses by all known boards in an 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import combinations
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -46,10 +47,10 @@ class BoardMap:
         placed = [_moved(*self._known[number], one) for number, one in measured.items() if number in self._known]
         if not placed:
             return Doubtful(NO_KNOWN)
-        camera = _fused(placed)
-        if not all(_near(one.world_from_camera, camera.world_from_camera, 2 * AGREE_M, 2 * AGREE_RAD)
-                   for one in placed):
+        if not all(_near(one.world_from_camera, other.world_from_camera, 2 * AGREE_M, 2 * AGREE_RAD)
+                   for one, other in combinations(placed, 2)):
             return Doubtful(DISAGREE)
+        camera = _fused(placed)
         for number, one in measured.items():
             if number not in self._known:
                 self._look(number, camera.world_from_camera @ np.linalg.inv(one.world_from_camera))

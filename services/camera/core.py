@@ -23,7 +23,6 @@ from saccade.shared.errors import SaccadeError
 from saccade.shared.loop.service import Inputs, Service
 from saccade.shared.world.geometry import IMAGE_SIZE_PX, INTRINSICS_PX
 from saccade.shared.world.goal_image import LONGEST_PX, GoalImage, read_goal_image
-from saccade.shared.world.images import Size
 from saccade.shared.world.photographs import read_photograph
 from saccade.shared.world.task import start_pose
 
@@ -115,7 +114,7 @@ def build(config: Config) -> Camera:
     source = ros.source if ros else open_source(camera.source, rate_hz=camera.rate_hz)
     poses = _poses_of(config, ros)
     poses = poses.matched([path.name for path in getattr(source, "paths", ())])
-    lens, told = _lens(camera, poses, source.size_px)
+    lens, told = _lens(camera, poses, source)
     virtual_camera = VirtualCamera(source.size_px, lens=lens)
     goal = _goal_of(config, virtual_camera)
     still = ros is None and camera.poses is None and camera.board is None
@@ -139,9 +138,10 @@ def require_one_of_each(camera: CameraConfig) -> None:
         raise SaccadeError(BOARD_NEEDS)
 
 
-def _lens(camera: CameraConfig, poses: Poses, size_px: Size) -> tuple[Lens | None, tuple[str, ...]]:
-    """The lens of the images, and notes about it: what the user gives, else what the file of the poses or a
-    CameraInfo tells. None if nothing is known."""
+def _lens(camera: CameraConfig, poses: Poses, source: Source) -> tuple[Lens | None, tuple[str, ...]]:
+    """The lens of the images, and notes about it: what the user gives, else what the file of the poses or a CameraInfo
+    tells, else what the first picture of a folder says of itself. None if nothing is known."""
+    size_px = source.size_px
     if camera.calibration is not None:
         read = read_calibration(camera.calibration)
         lens = read.lens.at(size_px, "the calibration")
@@ -152,7 +152,18 @@ def _lens(camera: CameraConfig, poses: Poses, size_px: Size) -> tuple[Lens | Non
         note = f"the distortion that {poses.lens_from} tells of is not removed, because camera.intrinsics_px is given"
         return Lens(camera.intrinsics_px, size_px), (note,) if kept else ()
     found, notes = poses.lens(size_px)
+    if found is None and isinstance(source, Folder):
+        return _photographed(source)
     return found, (*notes, *_removed(found))
+
+
+def _photographed(source: Folder) -> tuple[Lens | None, tuple[str, ...]]:
+    """The lens by the EXIF data of the first picture, and a note about it. None if they say nothing of it."""
+    first = source.paths[0]
+    photo = read_photograph(first, longest_px=max(source.size_px), what="image")
+    if photo.assumed:
+        return None, ()
+    return Lens(photo.intrinsics_px, photo.size_px), (f"image {first.name}: {photo.told}, for all images",)
 
 
 def _removed(lens: Lens | None) -> tuple[str, ...]:

@@ -18,16 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from saccade.services.camera.opencv import opencv
+from saccade.services.camera.video import VideoFile
 from saccade.shared.errors import NAME_LIMIT, SaccadeError, printable
-from saccade.shared.world.images import MAX_PIXELS, Size, image_size, read_image
+from saccade.shared.world.images import Size, image_size, read_image
 
 WEBCAM_DIGITS = 4
 ROS_PREFIX = "ros:"  # of a topic that is heard live
 MAX_IMAGES, MAX_ENTRIES = 100_000, 1_000_000  # of a folder
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 DEFAULT_RATE_HZ = 10.0
-MAX_RATE_HZ = 1000.0  # a higher frame rate in a video's header is not believed
-WHOLE = 0.9  # share of the announced frames that a video must have; some formats only estimate their number
 RELEASE_S = 1.0  # how long to wait for a webcam's thread to end
 SILENT_S = 5.0  # after this time without an image a webcam counts as failed
 
@@ -161,51 +160,18 @@ def _common_size(paths: list[Path]) -> Size:
 class Video:
     """A video file. Each image has the time of its frame, or a time by the frame rate if the frame has none.
 
-    Raises SaccadeError if OpenCV is not installed, or if the file is damaged or of an unknown format.
+    Raises SaccadeError if PyAV is not installed, or if the file is damaged or of an unknown format.
     """
 
     endless = False
 
     def __init__(self, path: Path, rate_hz: float = DEFAULT_RATE_HZ):
-        self.name = str(path)
-        self._path = path
-        capture, first = self._begin()
-        fps = capture.get(_cv2().CAP_PROP_FPS)
-        self._announced = capture.get(_cv2().CAP_PROP_FRAME_COUNT)
-        capture.release()
-        self.period_s = 1.0 / (fps if 0 < fps <= MAX_RATE_HZ else rate_hz)
-        self.size_px = _size(first)
-
-    def _begin(self) -> tuple[Any, NDArray[np.uint8]]:
-        capture = _capture(self.name)
-        width, height = (capture.get(what) for what in (_cv2().CAP_PROP_FRAME_WIDTH, _cv2().CAP_PROP_FRAME_HEIGHT))
-        if width * height > MAX_PIXELS:  # told by the header, before one is decoded
-            capture.release()
-            raise SaccadeError(f"video {self._path} has {width:.0f}x{height:.0f} pixels, more than {MAX_PIXELS}: "
-                               "give a smaller one")
-        read, bgr = capture.read()
-        if not read:
-            capture.release()
-            raise SaccadeError(f"video {self._path} cannot be read: it is damaged, empty, or of a format unknown to "
-                               "OpenCV; give another, or a folder of its images")
-        return capture, bgr
+        self.name, self._file = str(path), VideoFile(path, rate_hz)
+        self.period_s, self.size_px = self._file.period_s, self._file.size_px
 
     def __iter__(self) -> Iterator[SourceImage]:
-        capture, bgr = self._begin()
-        try:
-            time_s = -np.inf
-            for index in itertools.count():
-                stamp = capture.get(_cv2().CAP_PROP_POS_MSEC) / 1e3
-                time_s = stamp if stamp > time_s else time_s + self.period_s
-                yield SourceImage(_rgb(bgr), index, float(time_s))
-                read, bgr = capture.read()
-                if not read:
-                    break
-        finally:
-            capture.release()
-        if index + 1 < WHOLE * self._announced:
-            raise SaccadeError(f"video {self._path} breaks off after {index + 1} of {self._announced:.0f} frames: cut "
-                               "off what is damaged")
+        for index, (rgb, time_s) in enumerate(self._file):
+            yield SourceImage(rgb, index, time_s)
 
 
 class Webcam:
@@ -279,16 +245,16 @@ def _keep_newest(capture: Any, clock: Callable[[], float], newest: queue.Queue, 
 
 
 def _cv2() -> Any:
-    """OpenCV, imported when the first video or webcam is opened. Raises SaccadeError if it is not installed."""
-    return opencv("videos and webcams need", ", or give a folder of images")
+    """OpenCV, imported when the first webcam is opened. Raises SaccadeError if it is not installed."""
+    return opencv("webcams need", ", or give a folder of images")
 
 
-def _capture(what: str | int) -> Any:
+def _capture(number: int) -> Any:
     cv2 = _cv2()
     try:
-        return cv2.VideoCapture(what, cv2.CAP_FFMPEG if isinstance(what, str) else cv2.CAP_ANY)
+        return cv2.VideoCapture(number, cv2.CAP_ANY)
     except cv2.error as error:
-        raise SaccadeError(f"camera source {what} cannot be opened ({error}): give another one") from error
+        raise SaccadeError(f"webcam:{number} cannot be opened ({error}): give another one") from error
 
 
 def _rgb(bgr: NDArray[np.uint8]) -> NDArray[np.uint8]:

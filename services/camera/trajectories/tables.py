@@ -14,6 +14,7 @@ from saccade.services.camera.trajectories.trajectory import Asked, Key, Order, S
 from saccade.shared.world.geometry import Array
 
 NANOSECONDS = 1e17  # a first column beyond it is in nanoseconds since 1970
+SINCE_1970 = ((NANOSECONDS, 1e-9), (1e14, 1e-6), (1e11, 1e-3))  # beyond what a time has which unit (seconds)
 _TUM = "neither a JSON object nor the eight numbers of TUM: timestamp tx ty tz qx qy qz qw"
 _KITTI = "not the twelve numbers of KITTI: the rows of a 3x4 matrix"
 _EUROC = "not the first eight numbers of EuRoC: time in ns, position x y z, quaternion w x y z"
@@ -35,6 +36,15 @@ def order_of(header: list[str], usual: Order) -> Order:
     return "xyzw" if ends[3:4] == ["w"] else usual
 
 
+def columns_of(header: list[str]) -> list[int] | None:
+    """Where the columns x, y, z of the position and qx, qy, qz, qw are, by their names. None if these do not tell."""
+    if len(header) != 8:
+        return None
+    place = {("q" if word.startswith("q") else "") + word[-1:]: k for k, word in enumerate(header) if k}
+    wanted = ("x", "y", "z", "qx", "qy", "qz", "qw")
+    return [place[name] for name in wanted] if set(place) == set(wanted) else None
+
+
 def data_of(path: Path, text: str) -> list[Line]:
     """The lines with numbers: without a line of names that is no comment."""
     lines = lines_of(path, text)
@@ -46,16 +56,18 @@ def data_of(path: Path, text: str) -> list[Line]:
 
 
 def read_tum(path: Path, text: str, asked: Asked) -> Stored:
-    """Reads `timestamp tx ty tz qx qy qz qw`, between blanks, tabs or commas. Lines may be in any order of time, which
-    is in seconds, or in nanoseconds since 1970. Raises SaccadeError with file:line if a line is damaged or repeats a
-    time."""
-    order = asked.quaternion or order_of(header_of(text), "xyzw")
+    """Reads `timestamp tx ty tz qx qy qz qw`, between blanks, tabs or commas, or in the order that a line of names
+    tells. Lines may be in any order of time, which is in seconds, or since 1970 in a smaller unit. Raises SaccadeError
+    with file:line if a line is damaged or repeats a time."""
+    header = header_of(text)
+    columns = None if asked.quaternion else columns_of(header)
+    order = asked.quaternion or ("xyzw" if columns else order_of(header, "xyzw"))
     table: dict[Key, Array] = {}
     times: list[float] = []
     back = None
     for number, line in data_of(path, text):
         with within(path, f":{number}"):
-            time_s, transform = _tum_line(line, order)
+            time_s, transform = _tum_line(line, order, columns)
             require_new(("time_s", time_s), table)
         back = back or (number if times and time_s < times[-1] else None)
         table["time_s", time_s] = transform
@@ -65,15 +77,15 @@ def read_tum(path: Path, text: str, asked: Asked) -> Stored:
                   notes=notes)
 
 
-def _tum_line(line: str, order: Order) -> tuple[float, Array]:
+def _tum_line(line: str, order: Order, columns: list[int] | None) -> tuple[float, Array]:
     try:
-        time_s, *rest = numbers_of(line)
+        numbers = numbers_of(line)
     except ValueError:
-        rest = []
-    if len(rest) != 7:
+        numbers = []
+    if len(numbers) != 8:
         raise ValueError(_TUM)
-    if time_s >= NANOSECONDS:
-        time_s *= 1e-9
+    time_s, *rest = [numbers[k] for k in (0, *columns)] if columns else numbers
+    time_s *= next((unit for beyond, unit in SINCE_1970 if time_s >= beyond), 1.0)
     if not np.isfinite(time_s):
         raise ValueError("the time is not finite: leave out the line")
     return time_s, from_quaternion(rest[:3], rest[3:], order)

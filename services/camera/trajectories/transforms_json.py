@@ -67,23 +67,23 @@ def read_transforms(path: Path, text: str) -> Stored:
     if len({kind for kind, _ in table}) > 1:
         raise SaccadeError(f"poses {path}: some frames have a file_path and some have none: give it to all or to none")
     return Stored("transforms", tuple(table), np.stack(list(table.values())), axes="opengl",
-                  lenses=_told_lenses(lenses), applied=applied, notes=_notes(tree))
+                  lenses=_told_lenses(lenses), applied=applied, notes=_notes(tree, lenses))
 
 
 def _told_lenses(lenses: list[Lens | None]) -> tuple[Lens, ...]:
-    """None if the file tells none of them, one if all are the same, else one for each frame."""
+    """The lenses that frames have: one if all are the same."""
     known = [x for x in lenses if x is not None]
-    if len(known) < len(lenses):
-        return ()
-    return (known[0],) if len(set(known)) == 1 else tuple(known)
+    return tuple(known[:1]) if len(set(known)) == 1 else tuple(known)
 
 
-def _notes(tree: Mapping[str, Any]) -> tuple[str, ...]:
-    scale = tree.get("applied_scale", 1.0)
-    if scale == 1.0:
-        return ()
-    return (f"applied_scale {told(scale)} is part of the poses: give its inverse as camera.poses_scale for the unit "
-            "before it",)
+def _notes(tree: Mapping[str, Any], lenses: list[Lens | None]) -> tuple[str, ...]:
+    notes, scale, known = [], tree.get("applied_scale", 1.0), len(lenses) - lenses.count(None)
+    if 0 < known < len(lenses):
+        notes.append(f"{known} of {len(lenses)} frames have intrinsics: they are taken for all")
+    if scale != 1.0:
+        notes.append(f"applied_scale {told(scale)} is part of the poses: give its inverse as camera.poses_scale for "
+                     "the unit before it")
+    return tuple(notes)
 
 
 def _square(rows: Any) -> Any:
