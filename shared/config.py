@@ -6,6 +6,7 @@ The text under each key is its description in the guide's reference.
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -364,7 +365,8 @@ def checked(model: type[Checked], tree: dict[str, Any], what: str, context: dict
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
         keys = f"; {_KEYS}" if model is Config and first["type"] == "extra_forbidden" else ""
-        raise SaccadeError(f"{what.replace('{}', told(key))}: {plain_of(first)}{keys}") from error
+        where = what.replace("{}", told(key)) if key else re.sub(r",?(?: key)? \{\}", "", what)  # the whole has no key
+        raise SaccadeError(f"{where}: {plain_of(first)}{keys}") from error
 
 
 def recorded(text: str | None, where: str) -> Config:

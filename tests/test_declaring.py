@@ -63,6 +63,15 @@ def test_a_view_that_was_compared_with_the_goal_image_counts_by_what_all_compari
     assert Evidence(0.1, 0.95, rival=True, elsewhere=0.9, agreement=0.8).is_enough
 
 
+def test_from_right_above_how_well_the_view_agrees_decides():
+    """There the azimuth says little, and with it what all views leave. Beside a rival more is asked for."""
+    assert Evidence(0.1, 0.3, agreement=0.5, above=True).is_enough
+    assert not Evidence(0.9, 0.99, agreement=0.3, above=True).is_enough
+    assert not Evidence(0.9, 0.99, rival=True, agreement=0.5, above=True).is_enough
+    assert Evidence(0.1, 0.3, rival=True, agreement=0.75, above=True).is_enough
+    assert Evidence(0.66, 0.02, above=True).probability == Evidence(0.66, 0.02).probability  # it was not compared
+
+
 def test_where_other_views_were_compared_one_that_cannot_be_needs_more():
     assert Evidence(0.39, 0.8).is_enough
     assert not Evidence(0.39, 0.8, compared=True).is_enough

@@ -62,6 +62,16 @@ def test_one_look_does_not_decide_against_the_others():
     assert looks[-1] == "there"
 
 
+def test_where_the_last_images_agree_the_hand_is_there_wherever_the_viewpoint_is_believed():
+    """One image that agrees by chance is not enough."""
+    hand, elsewhere, agrees = followed(), at(0.12), Evidence(0.1, 0.95, agreement=0.7)
+    assert [hand.take(elsewhere, agrees, EYE) for _ in range(2)] == ["stay"] * 2
+    assert hand.take(elsewhere, Evidence(0.1, 0.95), EYE) == "stay"
+    assert hand.take(elsewhere, agrees, EYE) == "there"
+    assert np.array_equal(hand.viewpoint, elsewhere)
+    assert hand.take(at(0), None, EYE) == "stay"
+
+
 @pytest.mark.parametrize(("agreements", "verdict"), [
     ((0.6, 0.6, 0.1, 0.6, 0.6), "there"), ((0.1, 0.1, 0.6, 0.1, 0.6), "wrong")])
 def test_the_mean_of_comparisons_with_the_goal_image_decides(agreements, verdict):

@@ -17,11 +17,12 @@ from saccade.shared.world.symmetry import turns_of
 
 Array = NDArray[np.float64]
 
-# Fitted to 1,400 views of goals of ten objects: the agreement from the goal's own direction, within what angle it falls
+# Fitted to 1,500 views of goals of ten objects: the agreement from the goal's own direction, within what angle it falls
 # to the e-th part, its standard deviation, and its mean from elsewhere, where it is distributed exponentially; but a
-# share of such views shows a side that is much like the goal's, and agrees up to a limit.
-AGREES, WITHIN_RAD, AGREES_STD, ELSEWHERE = 0.76, 0.24, 0.16, 0.1
-LIKE_IT, UP_TO = 0.05, 0.65
+# share of such views shows a side that is much like the goal's, and a share of views from the goal's own direction
+# fails to agree: these may agree however much.
+AGREES, WITHIN_RAD, AGREES_STD, ELSEWHERE = 0.7, 0.29, 0.13, 0.05
+LIKE_IT, FAILS = 0.06, 0.08
 UNEXPLAINED = 0.01  # chosen: share of views from anywhere that agree as those from elsewhere do
 POINTS = 0.12  # chosen: views that agree more than this point to the goal's direction
 POINTS_RIGHTLY = 0.8  # chosen: share of them that do so rightly
@@ -123,9 +124,9 @@ def _log_ratio(agreement: Array, way: Array, beside: Array) -> Array:
     """The log of how much likelier an agreement is if the goal's direction is `way` (rad) from here, and `beside` (rad)
     from where the view points to, than if it is elsewhere."""
     near = _near(way)
-    elsewhere = (1.0 - LIKE_IT) * np.exp(-agreement / ELSEWHERE) / ELSEWHERE + LIKE_IT / UP_TO * (agreement < UP_TO)
+    elsewhere = (1.0 - LIKE_IT) * np.exp(-agreement / ELSEWHERE) / ELSEWHERE + LIKE_IT
     apart = (agreement - AGREES * near) / AGREES_STD
-    here = np.exp(-0.5 * apart ** 2) / (AGREES_STD * np.sqrt(2 * np.pi))
+    here = (1.0 - FAILS) * np.exp(-0.5 * apart ** 2) / (AGREES_STD * np.sqrt(2 * np.pi)) + FAILS
     spread = (ANYHOW_RAD / POINTS_STD_RAD) ** 2 * np.exp(-0.5 * (beside / POINTS_STD_RAD) ** 2)
     points = np.where(agreement > POINTS, POINTS_RIGHTLY * spread + 1.0 - POINTS_RIGHTLY, 1.0)
     return np.asarray(np.log(near * here * points / elsewhere + 1.0 - near + UNEXPLAINED))

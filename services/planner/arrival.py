@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from saccade.services.planner.declaring import UNLIKELY, Evidence, around, fused_here
+from saccade.services.planner.declaring import FROM_ABOVE, UNLIKELY, Evidence, around, fused_here
 from saccade.services.planner.hand import Hand
 from saccade.services.planner.instances import Tried
 from saccade.shared.bus.messages import Belief
@@ -72,8 +72,9 @@ class Arrival:
 
     def _evidence(self, target: Belief, camera: Array, tried: Tried) -> Evidence:
         fused = fused_here(target, camera, self._symmetry[target.object])
+        above = float(unit(camera[:3, 3] - target.mean_m)[2]) > FROM_ABOVE
         return Evidence(target.goal_here, fused, tried.rivals.beside(camera, target.mean_m) is not None,
-                        tried.rivals.elsewhere(camera, target.mean_m), target.goal_agreement, self._compared)
+                        tried.rivals.elsewhere(camera, target.mean_m), target.goal_agreement, self._compared, above)
 
     def _is_at(self, eye: Array | None, camera: Array, evidence: Evidence) -> bool:
         """Whether the camera is where the goal's view is believed to be, now that it was compared. Where nobody follows

@@ -111,6 +111,8 @@ class Planner:
             chosen = self.plan = self._choose(stamp, mode, beliefs, camera, ground)
             if self.hand is not None:
                 chosen = self.plan = replace(chosen, viewpoint=self.hand.follow(chosen.viewpoint, spheres, eye))
+        if self.hand is not None and declared:  # the goal's view may be elsewhere than it was believed to be
+            chosen = self.plan = replace(chosen, viewpoint=self.hand.viewpoint)
         self.before = camera
         translation, rotation = ground.step(camera, self._heading(camera, chosen, beliefs), self.config.planner.step_m)
         if declared:  # the agent is judged at the pose at which it says that it has arrived, so it must not move

@@ -16,11 +16,13 @@ from saccade.shared.world.directions import alike
 from saccade.shared.world.geometry import Array, direction, rotation_angle, rotation_towards, unit, viewing_grid
 
 CERTAIN = 0.9  # chosen: beside a rival, or if the target is hidden, the posterior must be so sure
-ALIKE = 0.45  # chosen: so well a view must agree; nearly all from the goal's direction do, and no back of a can
+ALIKE = 0.35  # chosen: so well a view must agree; nearly all from the goal's direction do, and no back of a can
 CLEARLY_ALIKE = 0.7  # chosen: beside a rival a view must agree so well; views of another side hardly ever do
 IN_PART = 0.2  # chosen: a view that agrees so well is not given up, but the agent looks beside it
 SURE = 0.6  # chosen: the agent says so if looks and fused views together leave at least this probability
 COMPARED = 0.8  # chosen: and of a view that was compared at least this
+FROM_ABOVE = 0.98  # chosen: sine of the elevation from which on a small move changes the azimuth much
+ALIKE_ABOVE = 0.4  # chosen: from there a view that agrees so well is the goal's
 UNLIKELY = 0.25  # chosen: a view that has a lower probability is not the goal's
 CLEAR = 0.93  # chosen: looks that are clearer than this need no look at rivals; a view that may be wrong reaches 0.95
 FLOOR = 0.02  # chosen: neither the looks nor the fused views count as surer than this leaves
@@ -33,7 +35,9 @@ class Evidence(NamedTuple):
     """What speaks for the goal's view being here: the probability by the looks from here, that by all views, whether a
     rival direction is left from which the agent has not looked, the probability by the best looks elsewhere, and
     how well the view agrees with the goal image, if it was compared: then the probability by all views holds all of
-    this. Where other views were `compared`, and this one shows the object too large or elsewhere, more is asked for."""
+    this. Where other views were `compared`, and this one shows the object too large or elsewhere, more is asked for.
+    From right `above`, the azimuth of the camera says little of how the image is turned, and with it the probability by
+    all views; how well the view agrees says it."""
 
     look: float
     fused: float
@@ -41,10 +45,13 @@ class Evidence(NamedTuple):
     elsewhere: float = 0.0
     agreement: float | None = None
     compared: bool = False
+    above: bool = False
 
     @property
     def probability(self) -> float:
         """The probability that the goal's view is here."""
+        if self.agreement is not None and self.above:
+            return 1.0 - FLOOR if self.agreement > ALIKE_ABOVE else 0.0
         if self.agreement is not None:
             return self.fused if self.agreement > ALIKE else 0.0
         return together(self.look, self.fused if self.elsewhere < UNLIKELY else 1.0 - self.elsewhere)
@@ -57,7 +64,7 @@ class Evidence(NamedTuple):
     @property
     def is_enough(self) -> bool:
         """Whether the agent says that the camera is there."""
-        if self.look == 0.0:  # something hides the target here, so that this view says nothing
+        if self.look == 0.0 and self.agreement is None:  # something hides the target, so that this view says nothing
             return self.fused > CERTAIN and not self.rival
         if self.agreement is not None:
             is_clear = self.probability > CERTAIN and self.agreement > CLEARLY_ALIKE

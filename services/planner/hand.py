@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from typing import Literal
 
 import numpy as np
@@ -17,6 +18,7 @@ LOOKS, MOST_LOOKS = 5, 15  # chosen: at least and at most so many images decide 
 PATIENCE = 20  # chosen: after so many images within the task's tolerance a hand will not come nearer
 ELSEWHERE_M = 0.15  # chosen: a hand goes elsewhere if it is so much farther from the viewpoint than it has been
 MOVED_M = 0.03  # chosen: a plan is renewed if the believed view of the goal moves by more than this
+ALIKE_HERE = 0.4  # chosen: the last images agree so well, in the mean, if the camera is there wherever the viewpoint is
 SHIFTED_M = 0.015  # chosen: the same before it is decided whether the view is the goal's
 
 
@@ -30,15 +32,16 @@ class Hand:
 
     def __init__(self, renewed_after: int) -> None:
         self._renewed_after, self.there = renewed_after, False
+        self._lately: deque[float] = deque(maxlen=LOOKS)  # how well the last images agree with the goal image
 
     def follow(self, viewpoint: Array, spheres: Spheres, eye: Array | None) -> Array:
         """Begins with a new viewpoint [4, 4]. Returns it, at a position to which a hand can come. `eye` [3] is where
         the goal's view is believed to be."""
-        self._viewpoint, self._eye = pose(viewpoint[:3, :3], clip(viewpoint[:3, 3], spheres)), eye
+        self.viewpoint, self._eye = pose(viewpoint[:3, :3], clip(viewpoint[:3, 3], spheres)), eye
         self._nearest_m, self._age = np.inf, 0
         self._looks: list[float] = []
         self._agreements: list[float] = []
-        return self._viewpoint
+        return self.viewpoint
 
     def take(self, camera: Array, evidence: Evidence | None, eye: Array | None) -> Verdict:
         """Takes the camera's pose [4, 4] in an image.
@@ -46,16 +49,20 @@ class Hand:
         A viewpoint from which to search is reached within the task's tolerance. At one that may be the goal's,
         `evidence` speaks for it, by this image and by all. There the camera must be nearer, unless it has not come
         nearer for a while, and the mean of several images decides. The verdict `rival` asks for a look from another
-        direction before.
+        direction before. Where the last images agree well with the goal image, the camera is there, although the goal's
+        view is believed to be elsewhere; then this is the viewpoint.
         """
         self._age += 1
         if self.there:
-            return "there" if success(camera, self._viewpoint) else "stay"
+            return "there" if success(camera, self.viewpoint) else "stay"
+        if self._is_here(evidence):
+            self.viewpoint, self.there = camera, True
+            return "there"
         if evidence is not None and self._age >= self._renewed_after and self._has_moved(eye, MOVED_M):
             return "renew"
-        away_m = float(np.linalg.norm(camera[:3, 3] - self._viewpoint[:3, 3]))
+        away_m = float(np.linalg.norm(camera[:3, 3] - self.viewpoint[:3, 3]))
         self._nearest_m = min(self._nearest_m, away_m)
-        if not success(camera, self._viewpoint):
+        if not success(camera, self.viewpoint):
             self._looks.clear()
             self._agreements.clear()
             return "renew" if away_m > self._nearest_m + ELSEWHERE_M else "stay"
@@ -64,12 +71,17 @@ class Hand:
         self._looks.append(evidence.look)
         if evidence.agreement is not None:
             self._agreements.append(evidence.agreement)
-        near = away_m < NEAR_M and rotation_angle(camera[:3, :3], self._viewpoint[:3, :3]) < NEAR_RAD
+        near = away_m < NEAR_M and rotation_angle(camera[:3, :3], self.viewpoint[:3, :3]) < NEAR_RAD
         if len(self._looks) < (LOOKS if near else PATIENCE):
             return "stay"
         if self._has_moved(eye, SHIFTED_M):
             return "renew"
         return self._judge(evidence)
+
+    def _is_here(self, evidence: Evidence | None) -> bool:
+        self._lately.append(0.0 if evidence is None or evidence.agreement is None else evidence.agreement)
+        return evidence is not None and evidence.agreement is not None and evidence.is_enough and (
+            sum(self._lately) > LOOKS * ALIKE_HERE)
 
     def _judge(self, evidence: Evidence) -> Verdict:
         """Whether the view is the goal's, by the looks at it so far; `stay` asks for more of them."""

@@ -154,6 +154,7 @@ class Chooser:
     def _image_topic(self) -> str:
         asked = self.camera.image_topic
         if asked is not None:
+            asked = asked if asked in self.images else f"/{asked.lstrip('/')}"  # people leave the slash out
             if asked in self.images:
                 return asked
             if asked in self.undecodable:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -95,4 +96,10 @@ def _uncompressed(data: bytes) -> Pixels:
             raise
         except Exception as error:  # Pillow raises many kinds for images that are damaged or made to harm
             raise RosError("it is no whole JPEG or PNG "
-                           f"({printable(str(error) or type(error).__name__, MAX_REASON)})") from error
+                           f"({printable(_reason(error), MAX_REASON)})") from error
+
+
+def _reason(error: Exception) -> str:
+    """What Pillow says, without the names of objects in memory."""
+    said = re.sub(r"\s*<[^>]*>", "", str(error))
+    return said or type(error).__name__
