@@ -1,9 +1,11 @@
-"""The guide's page about the camera: its sections about boards and about pictures alone, followed word by word."""
+"""The guide's page about the camera, followed word by word: a folder, a film and poses, boards, and pictures alone."""
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from PIL import Image
 pytest.importorskip("cv2")
 pytest.importorskip("av")
 
+from saccade.benchmarks.board_scene import SIZE as FILM_SIZE
 from saccade.benchmarks.board_scene import encode
 from saccade.services.camera.calibration import Calibration
 from saccade.shared.config import PACKAGE
@@ -19,6 +22,7 @@ from saccade.shared.render.objects import load_mesh, names_of
 from saccade.shared.render.world import World
 from saccade.shared.world.geometry import direction, look_at
 from saccade.tests.fakes.board import PINHOLE, SIZE, both_on_the_table, view
+from saccade.tests.fakes.camera import tum, written
 from saccade.tests.front_door import call
 
 PAGE = (PACKAGE / "docs" / "camera.md").read_text()
@@ -75,6 +79,36 @@ def test_the_sections_are_followed_word_by_word(desk, monkeypatch, capsys):
     assert "is no substitute for poses" in shown.replace("\n", " ")
     assert "is no substitute for poses" in said["## Pictures of which nothing is known"].replace("\n", " ")
     assert (desk / "map.json").is_file()
+
+
+def test_a_folder_a_film_and_their_poses_are_followed_word_by_word(tmp_path, monkeypatch, capsys):
+    """With a shorter first run. The film has its images, and the poses are those of the page, as TUM."""
+    monkeypatch.chdir(tmp_path)
+
+    def said(line: str) -> str:
+        words = shlex.split(line + (LOCAL if line.startswith("saccade run") else ""))[1:]
+        code, out, err = call(monkeypatch, capsys, *words)
+        assert code == 0, (line, err)
+        return out + err
+
+    folder = section("## Images from a folder")
+    first, = re.findall(r"`(saccade run [^`]*)`", folder)
+    said(first.replace(" --plain", " --set simulator.max_steps=3"))
+    exec(re.search(r'title="images_of_a_run.py"\n(.*?)^```', folder, re.MULTILINE | re.DOTALL)[1], {})
+    seen = "".join(map(said, commands(folder)))
+    assert "3 views" in seen
+    assert "found" in seen
+    goal, = commands(section("## What you should see"))
+    assert "goal image my_view.png: " in said(goal)
+    shown = said(*commands(section("### Look at the poses first")))
+    assert "poses: 3 (000.png to 002.png)" in shown
+    assert (tmp_path / "cameras.png").is_file()
+    poses = [json.loads(text)["world_from_camera"] for text in Path("my_poses.jsonl").read_text().splitlines()]
+    written(tmp_path / "my_trajectory.txt", *(tum(k / 10, np.array(each)) for k, each in enumerate(poses)))
+    images = [Image.open(f"my_images/00{k}.png").resize(FILM_SIZE) for k in range(3)]
+    encode(map(np.array, images), tmp_path / "my_video.mp4")
+    film = commands(section("## Videos and webcams"))[0]
+    assert "3 views" in said(film)
 
 
 def test_what_can_go_wrong_is_told_as_the_page_says():
