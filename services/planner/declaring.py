@@ -16,7 +16,7 @@ from saccade.shared.world.directions import alike
 from saccade.shared.world.geometry import Array, direction, rotation_angle, rotation_towards, unit, viewing_grid
 
 CERTAIN = 0.9  # chosen: beside a rival, or if the target is hidden, the posterior must be so sure
-ALIKE = 0.35  # chosen: so well a view must agree; nearly all from the goal's direction do, and no back of a can
+ALIKE = 0.45  # chosen: so well a view must agree; nearly all from the goal's direction do, and no back of a can
 CLEARLY_ALIKE = 0.7  # chosen: beside a rival a view must agree so well; views of another side hardly ever do
 IN_PART = 0.2  # chosen: a view that agrees so well is not given up, but the agent looks beside it
 SURE = 0.6  # chosen: the agent says so if looks and fused views together leave at least this probability

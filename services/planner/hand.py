@@ -18,7 +18,8 @@ LOOKS, MOST_LOOKS = 5, 15  # chosen: at least and at most so many images decide 
 PATIENCE = 20  # chosen: after so many images within the task's tolerance a hand will not come nearer
 ELSEWHERE_M = 0.15  # chosen: a hand goes elsewhere if it is so much farther from the viewpoint than it has been
 MOVED_M = 0.03  # chosen: a plan is renewed if the believed view of the goal moves by more than this
-ALIKE_HERE = 0.4  # chosen: the last images agree so well, in the mean, if the camera is there wherever the viewpoint is
+# Chosen: within this of where the goal's view is believed to be, images that agree so well in the mean are the goal's.
+ALIKE_M, ALIKE_HERE = 0.05, 0.45
 SHIFTED_M = 0.015  # chosen: the same before it is decided whether the view is the goal's
 
 
@@ -50,12 +51,12 @@ class Hand:
         `evidence` speaks for it, by this image and by all. There the camera must be nearer, unless it has not come
         nearer for a while, and the mean of several images decides. The verdict `rival` asks for a look from another
         direction before. Where the last images agree well with the goal image, the camera is there, although the goal's
-        view is believed to be elsewhere; then this is the viewpoint.
+        view is believed to be a bit aside; then this is the viewpoint.
         """
         self._age += 1
         if self.there:
             return "there" if success(camera, self.viewpoint) else "stay"
-        if self._is_here(evidence):
+        if self._is_here(camera, evidence, eye):
             self.viewpoint, self.there = camera, True
             return "there"
         if evidence is not None and self._age >= self._renewed_after and self._has_moved(eye, MOVED_M):
@@ -78,10 +79,11 @@ class Hand:
             return "renew"
         return self._judge(evidence)
 
-    def _is_here(self, evidence: Evidence | None) -> bool:
+    def _is_here(self, camera: Array, evidence: Evidence | None, eye: Array | None) -> bool:
         self._lately.append(0.0 if evidence is None or evidence.agreement is None else evidence.agreement)
-        return evidence is not None and evidence.agreement is not None and evidence.is_enough and (
-            sum(self._lately) > LOOKS * ALIKE_HERE)
+        if evidence is None or evidence.agreement is None or eye is None or not evidence.is_enough:
+            return False
+        return bool(np.linalg.norm(camera[:3, 3] - eye) < ALIKE_M) and sum(self._lately) > LOOKS * ALIKE_HERE
 
     def _judge(self, evidence: Evidence) -> Verdict:
         """Whether the view is the goal's, by the looks at it so far; `stay` asks for more of them."""
