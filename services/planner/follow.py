@@ -1,7 +1,7 @@
 """The planner of the paper's PoseCNN: it follows the transform between the target's pose now and in the goal image.
 
-The percepts must carry poses. Every step moves the camera by at most 5 cm towards the goal's view. Where the target is
-not seen, the camera stops. `seek` looks for it instead.
+The percepts must carry poses. Every step moves the camera by at most 5 cm towards the goal's view, and turns it by the
+same share of what is left to turn. Where the target is not seen, the camera stops. `seek` looks for it instead.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from saccade.services.planner.motion import step_towards
 from saccade.services.planner.outputs import outputs
@@ -17,7 +18,7 @@ from saccade.shared.bus.topics import ACTION, GOAL_PERCEPT, PERCEPT, PLAN, Outpu
 from saccade.shared.config import Config
 from saccade.shared.errors import SaccadeError
 from saccade.shared.loop.service import Inputs, Service
-from saccade.shared.world.geometry import Array, rotation_angle
+from saccade.shared.world.geometry import Array, pose, rotation_angle
 from saccade.shared.world.task import Spheres
 
 SERVICE = Service("planner", inputs=(PERCEPT, GOAL_PERCEPT), trigger=PERCEPT, outputs=(PLAN, ACTION))
@@ -67,7 +68,8 @@ class Follower:
         viewpoint = goal_view(percept, goal)
         distance = float(np.linalg.norm(viewpoint[:3, 3] - camera[:3, 3]))
         turn = float(rotation_angle(viewpoint[:3, :3], camera[:3, :3]))
-        move = step_towards(camera, viewpoint, spheres, self.step_m)
+        move = step_towards(camera, on_the_way(camera, viewpoint, self.step_m / max(distance, self.step_m)), spheres,
+                            self.step_m)
         arrived = distance < ARRIVED_M and turn < ARRIVED_RAD
         center = (camera @ np.asarray(percept.camera_from_object))[:3, 3]
         return outputs(percept, viewpoint, move, look_at_m=center, target=goal.object, goal_confidence=goal.presence,
@@ -82,6 +84,15 @@ def goal_view(percept: Percept, goal: Percept) -> Array:
     """The pose world_from_camera [4, 4] from which the goal image was taken, by the target's poses in both images."""
     there = np.linalg.inv(np.asarray(goal.camera_from_object))
     return np.asarray(percept.world_from_camera @ np.asarray(percept.camera_from_object) @ there)
+
+
+def on_the_way(camera: Array, viewpoint: Array, share: float) -> Array:
+    """The viewpoint [4, 4] with the attitude that belongs to this share of the way from a camera [4, 4] to it.
+
+    Whoever turns at once as at the goal loses sight of the target on the way.
+    """
+    turn = Rotation.from_matrix(viewpoint[:3, :3] @ camera[:3, :3].T).as_rotvec()
+    return pose(Rotation.from_rotvec(share * turn).as_matrix() @ camera[:3, :3], viewpoint[:3, 3])
 
 
 def build(config: Config) -> Follower:
