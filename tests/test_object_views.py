@@ -362,9 +362,9 @@ def test_options_that_do_not_go_together_are_one_line(home, capsys, monkeypatch,
     assert told.count("\n") == 1
 
 
-def test_a_video_without_opencv_is_one_line(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "cv2", None)
+def test_a_video_without_pyav_is_one_line(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "av", None)
     Path(tmp_path / "tea.mp4").write_bytes(b"video")
     (tmp_path / "poses.jsonl").write_text(json.dumps({"index": 0, "world_from_camera": np.eye(4).tolist()}))
-    with pytest.raises(SaccadeError, match="videos and webcams need OpenCV"):
+    with pytest.raises(SaccadeError, match="videos need PyAV"):
         list(pictures_of(tmp_path / "tea.mp4", Told(tmp_path / "poses.jsonl")))
