@@ -1,7 +1,7 @@
 """`python -m saccade.benchmarks.crowd [out.json]` compares a step with fifteen objects on the table with one with five.
 
-The scenes are heaps of fifteen objects of YCB, drawn as in the suite `crowd`, and the same heaps with the first five
-alone. The agent explores, so that it comes to know what is there. Both take turns, round after round.
+The scenes are heaps of fifteen objects of YCB, drawn as in the suite `crowd`, and the same heaps with the target and
+four others alone. The agent explores, so that it comes to know what is there. Both take turns, round after round.
 """
 
 from __future__ import annotations
